@@ -1,0 +1,90 @@
+"""Every setting of generation, frozen: YAML or keyword values in, one checked `Config` and its digest out.
+
+A section belongs to one step. The one line of `description` is what `augkitti config show` prints beside the default.
+Lengths are metres, angles radians, times seconds; the unit stands in the name.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from augkitti.errors import InputError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class GroundConfig(_Section):
+    """Ground plane and local height map (`ground.py`)."""
+
+
+class DrivableConfig(_Section):
+    """Where a car may stand (`drivable.py`)."""
+
+
+class MoversConfig(_Section):
+    """Unlabelled moving things (`movers.py`)."""
+
+
+class PlacementConfig(_Section):
+    """Where cars are put (`placement.py`)."""
+
+
+class MotionConfig(_Section):
+    """How cars move (`vehicle_motion.py`)."""
+
+
+class Config(_Section):
+    """The whole configuration of a data set; its digest stands in every shard."""
+
+    cars: tuple[int, int] = Field((1, 3), description="virtual cars a pair, from and to; 0 0 writes plain pairs")
+    categories: tuple[Literal["Car", "Van", "Truck"], ...] = Field(
+        ("Car",), description="KITTI categories that virtual cars are drawn from"
+    )
+    min_points: int = Field(20, ge=1, description="returns that each virtual car has at least in both scans")
+    glass: Literal["pass", "opaque"] = Field("pass", description="whether panes let the pulse through")
+    shutter: Literal["rolling", "snapshot"] = Field(
+        "rolling", description="cast each ray at its own firing time, or all at one moment (raw scans)"
+    )
+    ground: GroundConfig = Field(GroundConfig(), description="ground plane and local height map")
+    drivable: DrivableConfig = Field(DrivableConfig(), description="where a car may stand")
+    movers: MoversConfig = Field(MoversConfig(), description="unlabelled moving things")
+    placement: PlacementConfig = Field(PlacementConfig(), description="where cars are put")
+    motion: MotionConfig = Field(MotionConfig(), description="how cars move")
+
+    def digest(self) -> str:
+        """sha256 over the sorted JSON of all values."""
+        return hashlib.sha256(json.dumps(self.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+
+
+def load_config(path: Path | None, **changes: Any) -> Config:
+    """Read a YAML file (None: defaults) and apply `changes` (None values are left out) on top.
+
+    Raises:
+        InputError: the file is missing, not YAML, or holds an unknown key or a value out of range.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as err:
+            raise InputError(
+                path, f"not readable as YAML ({err})", "see `augkitti config show` for a valid file"
+            ) from err
+        if loaded is not None and not isinstance(loaded, dict):
+            raise InputError(path, "not a table of keys and values", "see `augkitti config show` for a valid file")
+        values = loaded or {}
+    values.update({key: value for key, value in changes.items() if value is not None})
+    try:
+        return Config.model_validate(values)
+    except ValidationError as err:
+        first = err.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            path or "options", f"key `{key}`: {first['msg']}", "see `augkitti config show` for keys and defaults"
+        ) from err

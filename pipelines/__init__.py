@@ -1,0 +1,1 @@
+"""Staged jobs over the `augkitti` library: a KITTI folder in, a data set folder out."""

@@ -1,0 +1,26 @@
+"""Fixtures that several test modules share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def kitti_root() -> Path:
+    """The folder of real scans, or a skip that says how to name it."""
+    root = Path(os.environ.get("AUGKITTI_TEST_KITTI", ROOT.parent / "shared" / "kitti"))
+    if not (root / "raw").is_dir():
+        pytest.skip(f"no real scans at {root}: set AUGKITTI_TEST_KITTI")
+    return root
+
+
+@pytest.fixture(scope="session")
+def cad_root() -> Path:
+    """The folder of real car models, or a skip that says how to name it."""
+    root = Path(os.environ.get("AUGKITTI_TEST_CAD", ROOT.parent / "shared" / "cad"))
+    if not (root / "manifest.json").is_file():
+        pytest.skip(f"no car models at {root}: set AUGKITTI_TEST_CAD")
+    return root
