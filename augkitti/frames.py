@@ -160,7 +160,7 @@ def box_pose(box: Array) -> F64:
 
 
 def points_in_box(points: Array, T_a_box: F64, size_m: Array, grow_m: float = 0.0) -> npt.NDArray[np.bool_]:
-    """Which points (N, 3) in a lie in the box of `size_m` (length, width, height) centred at `T_a_box`, grown all round."""
+    """Which points (N, 3) in a lie in the box of `size_m` (length, width, height) at `T_a_box`, grown all round."""
     local = transform_points(invert(T_a_box), points)
     half = np.asarray(size_m, dtype=np.float64) / 2.0 + grow_m
     return np.asarray((np.abs(local) <= half).all(axis=-1))

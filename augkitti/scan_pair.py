@@ -1,4 +1,4 @@
-"""Records that pass between the steps: scans, their rays, labels, cars and the finished pair; arrays only, no behaviour.
+"""Records that pass between the steps: scans, rays, labels, cars, the finished pair; arrays only, no behaviour.
 
 Field names follow the shard contract. N is the number of valid points of a scan, R of its fired rays.
 """
