@@ -51,7 +51,7 @@ class ScanRays:
 
     ring: U8  # (N,) of each point
     tick: U16  # (N,) of each point; NO_TICK for compensated scans and stray points
-    ray: I32  # (N,) index of the point's ray; -1 for a stray point
+    ray: I32  # (N,) index of the point's ray (a stray point has one of its own at the end, with NO_TICK)
     ray_ring: U8  # (R,)
     ray_tick: U16  # (R,); NO_TICK for compensated scans
     ray_azimuth_rad: F64  # (R,) direction of the beam seen from above, counter-clockwise from +x

@@ -1,0 +1,347 @@
+"""Scanner profile and rays: a scan's points in, the ring and tick of each point and every fired ray out.
+
+Conventions (scanner.md section 1, measured on real KITTI scans): the encoder has 4000 ticks a revolution; at one firing
+all 64 beams share a tick t; beam b then looks along `alpha = 2 pi / 4000 (t + tick_offset_b) + azimuth_b`, from
+`(-side_b sin alpha, side_b cos alpha, height_b)`. The scanner turns clockwise: time runs with decreasing tick, from
+t = 1999 over 0 (straight ahead, the scan's middle) to t = 2000.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from augkitti.errors import InputError
+from augkitti.frames import F64, wrap_angle
+from augkitti.scan_pair import I32, NO_TICK, U8, U16, Bool, Scan, ScanRays
+
+DEFAULT_PROFILE = "hdl64e_kitti"
+_ON_RAY_M = 0.002  # scanner.md: p99.9 of the distance of a point to its ray is 0.78 mm; 2 mm settles the wrap trap
+_MIN_POINTS_OF_A_TICK = 4  # a fired tick has about 50 returns; fewer are stray points
+_DEFAULT_FIRINGS = 2150  # scanner.md: 2146 to 2164 fired ticks a scan
+
+
+@dataclass(frozen=True, eq=False)
+class ScannerProfile:
+    """What is known of one scanner: its beam table, encoder, quanta and shadow. All arrays are per beam, top first."""
+
+    name: str
+    version: int
+    source: str
+    lattice_size: int
+    seam_tick: int
+    firing_period_s: float
+    range_quantum_m: float
+    coordinate_quantum_m: float
+    reflectance_quantum: float
+    min_range_m: float
+    max_range_m: float
+    shadow_first_ring: int
+    elevation_rad: F64
+    height_m: F64
+    side_m: F64
+    azimuth_rad: F64
+    tick_offset: I32
+    range_phase_m: F64
+    range_bias_m: F64
+    blind: Bool = field(repr=False)  # (beams, lattice_size) the ego car's shadow
+    content: dict[str, Any] = field(repr=False)  # the file as read: what a shard carries along
+
+    @property
+    def beams(self) -> int:
+        """Number of beams."""
+        return len(self.elevation_rad)
+
+    @property
+    def tick_step_rad(self) -> float:
+        """Azimuth between two encoder ticks."""
+        return 2.0 * np.pi / self.lattice_size
+
+    @cached_property
+    def digest(self) -> str:
+        """sha256 of the profile's content."""
+        return hashlib.sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()
+
+
+def load_profile(path: Path | None = None) -> ScannerProfile:
+    """The shipped profile of KITTI's HDL-64E, or the one in a JSON file of the same form.
+
+    Raises:
+        InputError: the file is missing, not JSON, or a key is missing or of the wrong size.
+    """
+    if path is None:
+        text = (resources.files("augkitti") / "profiles" / f"{DEFAULT_PROFILE}.json").read_text(encoding="utf-8")
+        return profile_from_content(json.loads(text), DEFAULT_PROFILE)
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as err:
+        raise InputError(path, f"not readable as a scanner profile ({err})", "give a profile JSON file") from err
+    return profile_from_content(content, str(path))
+
+
+def profile_from_content(content: Any, where: str) -> ScannerProfile:
+    """A profile from the parsed JSON of its file, or of a shard's metadata; `where` names it in errors."""
+    if not isinstance(content, dict):
+        raise InputError(where, "not a scanner profile", "give a profile JSON file")
+    try:
+        elevation = np.asarray(content["elevation_rad"], dtype=np.float64)
+        beams, lattice = len(elevation), int(content["lattice_size"])
+
+        def column(key: str, scale: float = 1.0) -> F64:
+            values = np.asarray(content[key], dtype=np.float64) * scale
+            if values.shape != (beams,) or not np.isfinite(values).all():
+                raise ValueError(f"`{key}` needs {beams} finite numbers, one a beam")
+            return values
+
+        shadow = content["never_returned_ticks"]
+        if len(shadow) != beams:
+            raise ValueError(f"`never_returned_ticks` needs {beams} lists, one a beam")
+        blind = np.zeros((beams, lattice), dtype=bool)
+        for ring, intervals in enumerate(shadow):
+            for first, last in intervals:
+                if not 0 <= first <= last < lattice:
+                    raise ValueError(f"`never_returned_ticks` of beam {ring} leaves 0 to {lattice - 1}")
+                blind[ring, first : last + 1] = True
+        blind[: int(content["shadow_first_ring"])] = False
+        if not (1 <= beams <= 255 and beams < lattice < NO_TICK and (np.diff(elevation) < 0).all()):
+            raise ValueError("`elevation_rad` must fall from beam to beam, 1 to 255 beams, fewer than 65535 ticks")
+        return ScannerProfile(
+            name=str(content["name"]),
+            version=int(content["version"]),
+            source=str(content["source"]),
+            lattice_size=lattice,
+            seam_tick=int(content["seam_tick"]),
+            firing_period_s=float(content["firing_period_s"]),
+            range_quantum_m=float(content["range_quantum_m"]),
+            coordinate_quantum_m=float(content["coordinate_quantum_m"]),
+            reflectance_quantum=float(content["reflectance_quantum"]),
+            min_range_m=float(content["min_range_m"]),
+            max_range_m=float(content["max_range_m"]),
+            shadow_first_ring=int(content["shadow_first_ring"]),
+            elevation_rad=column("elevation_rad"),
+            height_m=column("height_m"),
+            side_m=column("side_m"),
+            azimuth_rad=column("azimuth_rad"),
+            tick_offset=column("tick_offset").astype(np.int32),
+            range_phase_m=column("range_phase_mm", 1e-3),
+            range_bias_m=column("range_bias_mm", 1e-3),
+            blind=blind,
+            content=content,
+        )
+    except KeyError as err:
+        raise InputError(where, f"key {err} is missing from the scanner profile", "see the shipped profile") from err
+    except (TypeError, ValueError, OverflowError, MemoryError) as err:
+        raise InputError(where, f"not a scanner profile: {err}", "see the shipped profile") from err
+
+
+def ray_lines(profile: ScannerProfile, ring: U8, azimuth_rad: F64, elevation_rad: F64) -> tuple[F64, F64]:
+    """Origins (R, 3) metres and unit directions (R, 3) of rays, velo frame at each ray's own firing."""
+    cos_a, sin_a = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    cos_e, sin_e = np.cos(elevation_rad), np.sin(elevation_rad)
+    side = profile.side_m[ring]
+    origin = np.stack([-side * sin_a, side * cos_a, profile.height_m[ring]], axis=-1)
+    direction = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
+    return origin, direction
+
+
+def tick_azimuth(profile: ScannerProfile, ring: U8, tick: U16) -> F64:
+    """Direction (radians in [-pi, pi)) in which beams look at ticks."""
+    steps = tick.astype(np.float64) + profile.tick_offset[ring]
+    return np.asarray(wrap_angle(steps * profile.tick_step_rad + profile.azimuth_rad[ring]), dtype=np.float64)
+
+
+def tick_time(profile: ScannerProfile, tick: U16, period_s: float) -> F64:
+    """Firing times (seconds from the scan's middle) of ticks in a revolution of `period_s`."""
+    order = (profile.seam_tick - 1 - tick.astype(np.int64)) % profile.lattice_size
+    return (order / profile.lattice_size - 0.5) * period_s
+
+
+def azimuth_time(azimuth_rad: float, period_s: float) -> float:
+    """When (seconds from the scan's middle) the scanner's own azimuth passes a bearing: it turns clockwise."""
+    return float(-wrap_angle(azimuth_rad) / (2.0 * np.pi) * period_s)
+
+
+def fire_rays(profile: ScannerProfile, fired_ticks: U16, period_s: float) -> ScanRays:
+    """All rays of a revolution with the given fired ticks (F,) ascending, none returned yet: for scanning a scene."""
+    ring = np.repeat(np.arange(profile.beams, dtype=np.uint8), len(fired_ticks))
+    tick = np.tile(fired_ticks.astype(np.uint16), profile.beams)
+    return ScanRays(
+        ring=np.zeros(0, np.uint8),
+        tick=np.zeros(0, np.uint16),
+        ray=np.zeros(0, np.int32),
+        ray_ring=ring,
+        ray_tick=tick,
+        ray_azimuth_rad=tick_azimuth(profile, ring, tick),
+        ray_elevation_rad=profile.elevation_rad[ring],
+        ray_time_s=tick_time(profile, tick, period_s),
+        ray_point=np.full(len(ring), -1, np.int32),
+        ray_blind=profile.blind[ring, tick],
+    )
+
+
+def assign_rays(scan: Scan, profile: ScannerProfile) -> ScanRays:
+    """The ring and tick of each point, and the whole bundle of fired rays.
+
+    Raw scans: rings are the runs of rising azimuth in the file, named by their elevation (so a scan with rings missing
+    works too); a point farther than 2 mm from its ray is tried on all other rings. Two points on one ray: the worse fit
+    is stray. A stray point keeps a ray of its own, without a tick, so that it can still be hidden by a car.
+
+    Compensated scans have no exact ticks. Approximation: a point's ray runs from the beam's origin through the point;
+    where the azimuth step between neighbours of a ring shows missing returns (1.5 steps of 360 / 2150 degrees or
+    more), rays are filled in evenly, their elevation interpolated relative to the beam table.
+    """
+    xyz = scan.xyz.astype(np.float64)
+    if scan.kind == "compensated":
+        return _compensated_rays(xyz, profile)
+    ring = _rings_by_run(xyz, profile)
+    tick, distance = _nearest_tick(xyz, ring, profile)
+    off = np.flatnonzero(distance > _ON_RAY_M)
+    if len(off):
+        ring[off], tick[off], distance[off] = _best_ring(xyz[off], profile)
+    on_ray = distance <= _ON_RAY_M
+    counts = np.bincount(tick[on_ray], minlength=profile.lattice_size)
+    fired = np.flatnonzero(counts >= min(_MIN_POINTS_OF_A_TICK, profile.beams))
+    column = np.full(profile.lattice_size, -1, dtype=np.int64)
+    column[fired] = np.arange(len(fired))
+    on_ray &= column[tick] >= 0
+
+    rays = fire_rays(profile, fired.astype(np.uint16), scan.period_s)
+    ray_of_point = np.where(on_ray, ring.astype(np.int64) * len(fired) + column[tick], -1)
+    candidates = np.flatnonzero(on_ray)
+    best_last = candidates[np.argsort(-distance[candidates], kind="stable")]
+    ray_point = np.full(len(rays), -1, dtype=np.int32)
+    ray_point[ray_of_point[best_last]] = best_last  # of two points on a ray the closer to it is written last and stays
+    lost = np.flatnonzero(on_ray)
+    lost = lost[ray_point[ray_of_point[lost]] != lost]
+    ray_of_point[lost] = -1
+    stray = np.flatnonzero(ray_of_point < 0)
+    ray_of_point[stray] = len(rays) + np.arange(len(stray))
+    known_tick = tick.astype(np.uint16)
+    known_tick[stray] = NO_TICK
+    azimuth, elevation = _line_through(xyz[stray], ring[stray], profile)
+    return ScanRays(
+        ring=ring,
+        tick=known_tick,
+        ray=ray_of_point.astype(np.int32),
+        ray_ring=np.concatenate([rays.ray_ring, ring[stray]]),
+        ray_tick=np.concatenate([rays.ray_tick, known_tick[stray]]),
+        ray_azimuth_rad=np.concatenate([rays.ray_azimuth_rad, azimuth]),
+        ray_elevation_rad=np.concatenate([rays.ray_elevation_rad, elevation]),
+        ray_time_s=np.concatenate([rays.ray_time_s, tick_time(profile, tick[stray].astype(np.uint16), scan.period_s)]),
+        ray_point=np.concatenate([ray_point, stray.astype(np.int32)]),
+        ray_blind=np.concatenate([rays.ray_blind, np.zeros(len(stray), dtype=bool)]),
+    )
+
+
+def ray_distance(scan: Scan, rays: ScanRays, profile: ScannerProfile) -> F64:
+    """Distance (N,) metres of each point from its ray: the rounding of coordinates, if all is right."""
+    r = rays.ray
+    origin, direction = ray_lines(profile, rays.ray_ring[r], rays.ray_azimuth_rad[r], rays.ray_elevation_rad[r])
+    offset = scan.xyz.astype(np.float64) - origin
+    along = (offset * direction).sum(axis=1)
+    return np.asarray(np.sqrt(((offset - along[:, None] * direction) ** 2).sum(axis=1)))
+
+
+def _rings_by_run(xyz: F64, profile: ScannerProfile) -> U8:
+    """Ring of each point by its run of rising azimuth; a run is named by the beam that it fits best."""
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]) % (2.0 * np.pi)
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(azimuth) < -np.pi) + 1, [len(xyz)]])
+    tan_e, height = np.tan(profile.elevation_rad), profile.height_m
+    rho = np.hypot(xyz[:, 0], xyz[:, 1])
+    rings = np.zeros(len(starts) - 1, dtype=np.uint8)
+    for run in range(len(rings)):
+        points = np.arange(starts[run], starts[run + 1])
+        points = points[:: max(1, len(points) // 64)]
+        misfit = np.abs(xyz[points, 2, None] - (height + tan_e * rho[points, None])) / rho[points, None]
+        rings[run] = np.argmin(np.median(misfit, axis=0)) if len(points) else 0
+    return np.repeat(rings, np.diff(starts))
+
+
+def _line_through(xyz: F64, ring: U8, profile: ScannerProfile) -> tuple[F64, F64]:
+    """Azimuth and elevation of the ray from each beam's origin through each point."""
+    rho = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), 1e-6)
+    side = profile.side_m[ring]
+    azimuth = wrap_angle(np.arctan2(xyz[:, 1], xyz[:, 0]) - np.arcsin(np.clip(side / rho, -1.0, 1.0)))
+    along = np.sqrt(np.maximum(rho * rho - side * side, 1e-12))
+    return np.asarray(azimuth), np.asarray(np.arctan2(xyz[:, 2] - profile.height_m[ring], along))
+
+
+def _nearest_tick(xyz: F64, ring: U8, profile: ScannerProfile) -> tuple[npt.NDArray[np.int64], F64]:
+    """Nearest tick (N,) of each point on its ring and the distance (N,) metres from that ray."""
+    rho = np.hypot(xyz[:, 0], xyz[:, 1])
+    side = profile.side_m[ring]
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]) - np.arcsin(np.clip(side / np.maximum(rho, 1e-6), -1.0, 1.0))
+    along = np.sqrt(np.maximum(rho * rho - side * side, 0.0))
+    ticks = (azimuth - profile.azimuth_rad[ring]) / profile.tick_step_rad
+    nearest = np.rint(ticks)
+    across = along * (ticks - nearest) * profile.tick_step_rad
+    elevation = profile.elevation_rad[ring]
+    above = np.cos(elevation) * (xyz[:, 2] - profile.height_m[ring]) - np.sin(elevation) * along
+    tick = (nearest.astype(np.int64) - profile.tick_offset[ring]) % profile.lattice_size
+    return tick, np.hypot(across, above)
+
+
+def _best_ring(xyz: F64, profile: ScannerProfile) -> tuple[U8, npt.NDArray[np.int64], F64]:
+    """Ring, tick and distance of the ray nearest to each of a few points, over all beams."""
+    ring = np.zeros(len(xyz), dtype=np.uint8)
+    tick, distance = _nearest_tick(xyz, ring, profile)
+    for candidate in range(1, profile.beams):
+        beam = np.full(len(xyz), candidate, dtype=np.uint8)
+        its_tick, its_distance = _nearest_tick(xyz, beam, profile)
+        closer = its_distance < distance
+        ring[closer], tick[closer], distance[closer] = candidate, its_tick[closer], its_distance[closer]
+    return ring, tick, distance
+
+
+def _compensated_rays(xyz: F64, profile: ScannerProfile) -> ScanRays:
+    ring = _rings_by_run(xyz, profile)
+    azimuth, elevation = _line_through(xyz, ring, profile)
+    step = 2.0 * np.pi / _DEFAULT_FIRINGS
+    order = np.lexsort((azimuth, ring))
+    rings, azimuths, elevations, points = [], [], [], []
+    for beam in range(profile.beams):
+        of_beam = order[np.searchsorted(ring[order], beam) : np.searchsorted(ring[order], beam, side="right")]
+        if len(of_beam) == 0:
+            continue
+        seen, deviation = azimuth[of_beam], elevation[of_beam] - profile.elevation_rad[beam]
+        gap = np.diff(np.concatenate([seen, [seen[0] + 2.0 * np.pi]]))
+        missing = np.maximum(np.rint(gap / step).astype(np.int64) - 1, 0) * (gap >= 1.5 * step)
+        left = np.repeat(np.arange(len(seen)), missing)
+        nth = np.arange(len(left)) - np.repeat(np.cumsum(missing) - missing, missing) + 1
+        share = nth / (missing[left] + 1)
+        filled = seen[left] + share * gap[left]
+        bent = deviation[left] * (1.0 - share) + np.roll(deviation, -1)[left] * share
+        rings.append(np.full(len(seen) + len(filled), beam, dtype=np.uint8))
+        azimuths.append(np.concatenate([seen, filled]))
+        elevations.append(profile.elevation_rad[beam] + np.concatenate([deviation, bent]))
+        points.append(np.concatenate([of_beam, np.full(len(filled), -1)]))
+    ray_ring = np.concatenate(rings) if rings else np.zeros(0, np.uint8)
+    ray_azimuth = np.asarray(wrap_angle(np.concatenate(azimuths))) if rings else np.zeros(0)
+    ray_elevation = np.concatenate(elevations) if rings else np.zeros(0)
+    ray_point = (np.concatenate(points) if rings else np.zeros(0)).astype(np.int32)
+    by_azimuth = np.lexsort((ray_azimuth, ray_ring))
+    ray_ring, ray_azimuth, ray_elevation = ray_ring[by_azimuth], ray_azimuth[by_azimuth], ray_elevation[by_azimuth]
+    ray_point = ray_point[by_azimuth]
+    ray_of_point = np.full(len(xyz), -1, dtype=np.int32)
+    returned = np.flatnonzero(ray_point >= 0)
+    ray_of_point[ray_point[returned]] = returned
+    ticks = np.rint((ray_azimuth - profile.azimuth_rad[ray_ring]) / profile.tick_step_rad).astype(np.int64)
+    tick = (ticks - profile.tick_offset[ray_ring]) % profile.lattice_size
+    return ScanRays(
+        ring=ring,
+        tick=np.full(len(xyz), NO_TICK, dtype=np.uint16),
+        ray=ray_of_point,
+        ray_ring=ray_ring,
+        ray_tick=np.full(len(ray_ring), NO_TICK, dtype=np.uint16),
+        ray_azimuth_rad=ray_azimuth,
+        ray_elevation_rad=ray_elevation,
+        ray_time_s=np.zeros(len(ray_ring)),
+        ray_point=ray_point,
+        ray_blind=profile.blind[ray_ring, tick] & (ray_point < 0),
+    )
