@@ -1,0 +1,158 @@
+"""Ray casting: a car model with its motion and a scan's rays in, every surface that each ray meets on the car out.
+
+Rays are carried into the car's own frame, each at its own firing time; the mesh never moves, so one Embree structure
+per model and process serves every pair. Embree works in float32 and only names the triangle; the range is worked out
+again in float64 from that triangle.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from augkitti.frames import F64, Array, invert, rotate_vectors, transform_points, wrap_angle
+from augkitti.scan_pair import GLASS, I32, MEASURED, U8, CarModel, ScanRays
+from augkitti.scanner import ScannerProfile, ray_lines
+
+MAX_LAYERS = 6  # both panes modelled twice, a head-rest between, and the far door
+_STEP_M = 1e-4  # past a hit before the next query: above float32 resolution at car size, below any pane's thickness
+_SAME_PANE_M = 0.03  # two layers of one pane: counted once
+_GRAZING = 1e-4  # cosine below which a ray runs along its triangle
+_START_BEFORE_M = 0.5  # rays start this far before the car, so that float32 keeps micrometres
+
+
+@dataclass(frozen=True, eq=False)
+class CarHits:
+    """What the rays that meet one car meet on it, in order of depth: panes first, then at most one solid surface."""
+
+    ray: I32  # (K,) index of the ray in the scan's rays, ascending
+    range_m: F64  # (K, L) from the ray's origin; inf where there is no further surface
+    face: I32  # (K, L) triangle of the model; -1 where none
+    surface: U8  # (K, L) PAINT, GLASS, ...; MEASURED where none
+    cos_incidence: F64  # (K, L) between 0 (grazing) and 1
+
+
+class _Structure:
+    """Embree's acceleration structure of one mesh, and what is needed to work out ranges in float64."""
+
+    def __init__(self, vertices: F64, faces: I32) -> None:
+        self.scene = EmbreeScene(robust=True)
+        self.mesh = TriangleMesh(self.scene, vertices.astype(np.float32), faces.astype(np.int32))
+        corner = vertices[faces]
+        self.corner = corner[:, 0]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        self.normal = normal / np.maximum(np.sqrt((normal * normal).sum(axis=1)), 1e-30)[:, None]
+
+    def first_hit(self, origin: F64, direction: F64) -> tuple[I32, F64, F64]:
+        """Face (-1: none), range and |cos incidence| of the first triangle on each ray."""
+        face = np.asarray(self.scene.run(origin.astype(np.float32), direction.astype(np.float32)), dtype=np.int32)
+        hit = face >= 0
+        n, c = self.normal[face], self.corner[face]
+        falling = (n * direction).sum(axis=1)
+        grazing = np.abs(falling) < _GRAZING
+        along = (n * (c - origin)).sum(axis=1) / np.where(grazing, 1.0, falling)
+        if (grazing & hit).any():  # the plane says nothing along itself; there Embree's own distance is the better one
+            g = np.flatnonzero(grazing & hit)
+            along[g] = self.scene.run(origin[g].astype(np.float32), direction[g].astype(np.float32), query="DISTANCE")
+        return face, np.where(hit, np.maximum(along, 0.0), np.inf), np.where(hit, np.abs(falling), 0.0)
+
+
+_structures: WeakKeyDictionary[CarModel, _Structure] = WeakKeyDictionary()
+
+
+def _structure(model: CarModel) -> _Structure:
+    if model not in _structures:
+        _structures[model] = _Structure(model.vertices, model.faces)
+    return _structures[model]
+
+
+def rays_near(rays: ScanRays, T_velo_car: F64, size_m: Array, grow_m: float) -> I32:
+    """Indices of the rays whose bearing and elevation can meet a box of `size_m` at `T_velo_car`, grown all round."""
+    half = np.asarray(size_m, dtype=np.float64) / 2.0 + grow_m
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.float64)
+    corners = transform_points(T_velo_car, signs * half)
+    distance = np.hypot(corners[:, 0], corners[:, 1])
+    centre = T_velo_car[:2, 3]
+    bearing = float(np.arctan2(centre[1], centre[0]))
+    off = wrap_angle(np.arctan2(corners[:, 1], corners[:, 0]) - bearing)
+    near = float(np.abs(transform_points(invert(T_velo_car), np.zeros(3))[:2] / half[:2]).max())
+    if near <= 1.0:  # the scanner stands over the box
+        return np.arange(len(rays), dtype=np.int32)
+    # Nearest approach of the footprint, not of its corners: a long side can come closer than both its ends.
+    closest = max(float(np.hypot(*centre)) - float(np.hypot(half[0], half[1])), 0.5)
+    low = np.arctan2(corners[:, 2].min() - 0.25, np.where(corners[:, 2].min() < 0.25, closest, distance.max()))
+    high = np.arctan2(corners[:, 2].max() - 0.1, np.where(corners[:, 2].max() > 0.1, closest, distance.max()))
+    margin = 0.03 / closest + 1e-3  # beams do not start at the frame's origin
+    bearing_off = wrap_angle(rays.ray_azimuth_rad - bearing)
+    inside = (bearing_off >= off.min() - margin) & (bearing_off <= off.max() + margin)
+    inside &= (rays.ray_elevation_rad >= low - margin) & (rays.ray_elevation_rad <= high + margin)
+    return np.flatnonzero(inside).astype(np.int32)
+
+
+def cast_car(
+    model: CarModel, T_car_scanner: F64, rays: ScanRays, candidates: I32, profile: ScannerProfile, opaque_glass: bool
+) -> CarHits:
+    """Meet one car with candidate rays (C,), the scanner standing at `T_car_scanner` (C, 4, 4) when each is fired.
+
+    With `opaque_glass` a pane ends the ray like any other surface.
+    """
+    origin, direction = ray_lines(
+        profile,
+        rays.ray_ring[candidates],
+        rays.ray_azimuth_rad[candidates],
+        rays.ray_elevation_rad[candidates],
+    )
+    return cast_mesh(
+        model,
+        candidates,
+        transform_points(T_car_scanner, origin),
+        rotate_vectors(T_car_scanner, direction),
+        opaque_glass,
+    )
+
+
+def cast_mesh(model: CarModel, ray: I32, origin: F64, direction: F64, opaque_glass: bool) -> CarHits:
+    """Meet a model with rays given in the car's frame: origins (C, 3) metres, unit directions (C, 3)."""
+    structure = _structure(model)
+    start, enters = _enter_box(origin, direction, model.size_m)
+    ray, origin, direction, start = ray[enters], origin[enters], direction[enters], start[enters]
+    count = len(ray)
+    ranges = np.full((count, MAX_LAYERS), np.inf)
+    faces = np.full((count, MAX_LAYERS), -1, dtype=np.int32)
+    cosines = np.zeros((count, MAX_LAYERS))
+    depth = np.zeros(count, dtype=np.int64)
+    active, at = np.arange(count), start
+    for _ in range(4 * MAX_LAYERS):  # twin layers of a pane take a query each without taking a place
+        if len(active) == 0:
+            break
+        o, d = origin[active], direction[active]
+        face, further, cosine = structure.first_hit(o + at[active, None] * d, d)
+        hit = face >= 0
+        active, face, cosine, reached = active[hit], face[hit], cosine[hit], (at[active] + further)[hit]
+        level = depth[active]
+        is_glass = model.surface[face] == GLASS
+        before = ranges[active, np.maximum(level - 1, 0)]
+        twin = (level > 0) & is_glass & (reached - before < _SAME_PANE_M)
+        new = ~twin
+        rows, level = active[new], level[new]
+        ranges[rows, level], faces[rows, level], cosines[rows, level] = reached[new], face[new], cosine[new]
+        depth[rows] += 1
+        at[active] = reached + _STEP_M
+        goes_on = is_glass & (not opaque_glass) & (depth[active] < MAX_LAYERS)
+        active = active[goes_on]
+    met = depth > 0
+    surface = np.where(faces >= 0, model.surface[faces], MEASURED).astype(np.uint8)
+    return CarHits(ray[met], ranges[met], faces[met], surface[met], cosines[met])
+
+
+def _enter_box(origin: F64, direction: F64, size_m: Array) -> tuple[F64, Any]:
+    """Where (metres along the ray) to start just before the model's box, and which rays meet the box at all."""
+    half = np.asarray(size_m, dtype=np.float64) / 2.0 + 1e-3
+    slope = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    a, b = (-half - origin) / slope, (half - origin) / slope
+    enter = np.minimum(a, b).max(axis=1)
+    leave = np.maximum(a, b).min(axis=1)
+    return np.maximum(enter - _START_BEFORE_M, 0.0), (leave >= np.maximum(enter, 0.0))
