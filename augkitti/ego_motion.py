@@ -162,7 +162,8 @@ def _align(xyz0: Array, xyz1: Array, T_velo1_velo0: F64, voxel_m: float, reach_m
 
 def _upright(xyz: Array) -> Array:
     """Points between 1 m below the scanner and 2 m above it, within 50 m: cars, walls, poles, trunks."""
-    return xyz[(xyz[:, 2] > -1.0) & (xyz[:, 2] < 2.0) & (np.abs(xyz[:, :2]).max(axis=1) < 50.0)]
+    kept: Array = xyz[(xyz[:, 2] > -1.0) & (xyz[:, 2] < 2.0) & (np.abs(xyz[:, :2]).max(axis=1) < 50.0)]
+    return kept
 
 
 def _rotation(row: Array) -> F64:

@@ -19,7 +19,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -343,17 +343,14 @@ def read_pair(
 
 
 def _raw_drives(root: Path) -> Iterator[Sequence]:
-    tracking = {}
-    for labels in _tracking_label_files(root):
-        source = manifest.tracking_source(labels.stem)
-        if source is not None:
-            tracking.setdefault(source.recording, (labels, source.first_frame))
+    tracking: dict[str, tuple[Path, int]] = {}
+    for path in _tracking_label_files(root):
+        source = manifest.tracking_source(path.stem)
+        if source is not None and _calib_beside(path).is_file():  # camera-frame boxes are of no use without it
+            tracking.setdefault(source.recording, (path, source.first_frame))
     for folder in _folders_with(root, "velodyne_points", depth=3):
         recording = folder.name.removesuffix("_sync")
         labels, first_frame = tracking.get(recording, (None, 0))
-        calib = labels.parent.parent / "calib" / labels.name if labels is not None else None
-        if calib is not None and not calib.is_file():
-            labels = calib = None  # camera-frame boxes are of no use without the camera's place
         yield Sequence(
             name=folder.name,
             recording=recording,
@@ -363,7 +360,7 @@ def _raw_drives(root: Path) -> Iterator[Sequence]:
             frames=_frames(folder / "velodyne_points" / "data", digits=10),
             calib=folder.parent,
             tracking_labels=labels,
-            tracking_calib=calib,
+            tracking_calib=None if labels is None else _calib_beside(labels),
             tracking_first_frame=first_frame,
         )
 
@@ -407,6 +404,10 @@ def _object_scans(root: Path) -> Iterator[Sequence]:
 def _tracking_label_files(root: Path) -> list[Path]:
     folders = [base / "training" / "label_02" for base in (root, root / "tracking", root.parent / "tracking")]
     return [path for folder in folders if folder.is_dir() for path in sorted(folder.glob("[0-9]*.txt"))]
+
+
+def _calib_beside(tracking_labels: Path) -> Path:
+    return tracking_labels.parent.parent / "calib" / tracking_labels.name
 
 
 def _folders_with(folder: Path, name: str, depth: int) -> Iterator[Path]:
@@ -488,7 +489,7 @@ def _stamp(path: Path, frame: int) -> float | None:
     text = lines[frame].strip() if frame < len(lines) else ""
     try:
         whole, _, fraction = text.partition(".")
-        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
         return moment.timestamp() + float(f"0.{fraction or 0}")
     except ValueError as err:
         raise InputError(path, f"line {frame + 1}, of frame {frame}, holds no time: `{text}`", _FETCH) from err

@@ -7,12 +7,9 @@ an installed wheel has its own copy.
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import yaml
-
-from augkitti.errors import InputError
 
 
 @dataclass(frozen=True)
