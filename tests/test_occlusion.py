@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from augkitti import occlusion, scanner
-from augkitti.scan_pair import NO_TICK, PAINT, I32, PreparedScan, Scan
+from augkitti.scan_pair import I32, NO_TICK, PAINT, PreparedScan, Scan
 from augkitti.sensor_noise import CarReturns
 
 PROFILE = scanner.load_profile()
