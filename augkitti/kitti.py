@@ -263,7 +263,7 @@ def label_reach(sequence: Sequence) -> tuple[Coverage, tuple[float, float] | Non
 def read_ego_motion(sequence: Sequence, frame0: int, scan0: Scan, scan1: Scan) -> EgoMotion:
     """`T_velo1_velo0` from frame0 to the next frame and its source; see `ego_motion.find_ego_motion`.
 
-    Takes 30 ms where the drive's files agree with the scans and up to half a second where the scans must be
+    Takes 40 ms where the drive's files agree with the scans and up to half a second where the scans must be
     registered, so `prepare` keeps it by `ego_motion_digest`.
 
     Raises:
@@ -591,8 +591,9 @@ def _sidecar_of(path: Path, stat: tuple[int, int]) -> dict[str, Any]:
         raise InputError(path, "holds keys other than `label_coverage` and `velo_poses`", remedy)
     if content.get("label_coverage", "none") not in ("none", "camera", "full"):
         raise InputError(path, "`label_coverage` is none of none, camera, full", remedy)
-    if not isinstance(content.get("velo_poses", ""), str):
-        raise InputError(path, "`velo_poses` is no file name", remedy)
+    name = content.get("velo_poses", "velo_poses.txt")
+    if not isinstance(name, str) or Path(name).name != name:
+        raise InputError(path, "`velo_poses` is no name of a file in this folder", remedy)
     return content
 
 
