@@ -115,17 +115,26 @@ def open_root(root: Path | str) -> KittiRoot:
     if not path.is_dir():
         problem = "is not a folder" if path.exists() else "does not exist"
         raise InputError(path, problem, _TREE)
+    sequences = tuple(sequence for sequence in find_sequences(path) if sequence.frames)
+    if not sequences:
+        raise InputError(path, "holds no KITTI scans", _TREE)
+    return KittiRoot(path, sequences)
+
+
+def find_sequences(root: Path) -> tuple[Sequence, ...]:
+    """Every sequence under a folder by name, those without a scan too; empty where there is none.
+
+    Raises:
+        InputError: a folder cannot be listed.
+    """
     try:
-        found = [*_raw_drives(path), *_odometry_sequences(path), *_object_scans(path)]
+        found = [*_raw_drives(root), *_odometry_sequences(root), *_object_scans(root)]
     except OSError as err:
-        raise InputError(path, f"cannot be listed ({err.strerror})", "check its permissions") from err
+        raise InputError(err.filename or root, f"cannot be listed ({err.strerror})", "check its permissions") from err
     by_name: dict[str, Sequence] = {}
     for sequence in found:  # the same name twice: the first in order of path counts
-        if sequence.frames:
-            by_name.setdefault(sequence.name, sequence)
-    if not by_name:
-        raise InputError(path, "holds no KITTI scans", _TREE)
-    return KittiRoot(path, tuple(by_name[name] for name in sorted(by_name)))
+        by_name.setdefault(sequence.name, sequence)
+    return tuple(by_name[name] for name in sorted(by_name))
 
 
 def valid_rows(rows: Array) -> Bool:
