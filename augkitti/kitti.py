@@ -272,7 +272,7 @@ def label_reach(sequence: Sequence) -> tuple[Coverage, tuple[float, float] | Non
 def read_ego_motion(sequence: Sequence, frame0: int, scan0: Scan, scan1: Scan) -> EgoMotion:
     """`T_velo1_velo0` from frame0 to the next frame and its source; see `ego_motion.find_ego_motion`.
 
-    Takes 40 ms where the drive's files agree with the scans and up to half a second where the scans must be
+    Takes 60 ms where the drive's files agree with the scans and up to half a second where the scans must be
     registered, so `prepare` keeps it by `ego_motion_digest`.
 
     Raises:
