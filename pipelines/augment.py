@@ -1,0 +1,136 @@
+"""Stage 2, per shard: a shard's plan in, one Parquet file and a row about it out.
+
+Reads: the plan, the source's scans and drive files, the cache of `prepare`, the car models.
+Writes: `OUT/data/<shard>.parquet` (temporary file, then rename) and `OUT/.augkitti-work/rows/<shard>.json` after it. A
+shard whose row and file match the plan is kept. A shard depends on configuration, seed and its own scans alone.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from itertools import chain
+
+import numpy as np
+
+from augkitti.augment_pair import augment_pair
+from augkitti.dataset_index import shard_entry
+from augkitti.errors import InputError
+from augkitti.kitti import Sequence, read_pair
+from augkitti.scan_pair import MEASURED, AugmentedPair, PreparedScan
+from augkitti.shards import shard_metadata, write_shard
+from pipelines.plan import Candidate, ShardPlan, stream
+from pipelines.prepare import cached_ego_motion, prepared_scan
+from pipelines.run import Options, Run, skip_entry
+from pipelines.shard_row import ShardRow, read_row, write_row
+from pipelines.stage import run_tasks
+
+NO_ROOM = "no virtual car found room"
+
+
+def augment_all(run: Run, jobs: int) -> list[ShardRow]:
+    """Make every shard of the plan that is not there yet; the rows of all, by shard.
+
+    Raises:
+        InputError: a source is unreadable and the run is to stop there.
+    """
+    items = [(shard, run.sequences[shard.sequence]) for shard in run.shards]
+    task = partial(augment_shard, options=run.options)
+    rows = list(run_tasks(task, items, jobs, "pairs", weight=lambda item: item[0].quota))
+    return sorted(rows, key=lambda row: row.shard.name)
+
+
+def augment_shard(item: tuple[ShardPlan, Sequence], options: Options) -> ShardRow:
+    """Make one shard, unless it is there.
+
+    Raises:
+        InputError: a source is unreadable and the run is to stop there; or the output cannot be written.
+    """
+    shard, sequence = item
+    done = read_row(options.work, options.out, shard)
+    if done is not None:
+        return done
+    totals: Counter[str] = Counter()
+    skipped: Counter[tuple[str, str]] = Counter()
+    path = options.out / "data" / f"{shard.name}.parquet"
+    try:
+        if path.exists():  # of a run that was cut off before it wrote the row
+            path.unlink()
+        pairs = _pairs(shard, sequence, options, totals, skipped)
+        first = next(pairs, None)
+        entry = None
+        if first is not None:
+            metadata = shard_metadata(options.config, options.scanner, options.models)
+            rows = write_shard(path, chain([first], pairs), metadata)
+            entry = shard_entry(options.out, path, sequence.name, sequence.recording, rows)
+        row = ShardRow(
+            shard=shard,
+            entry=entry,
+            totals=dict(sorted(totals.items())),
+            skipped=tuple({"source": s, "reason": r, "count": c} for (s, r), c in sorted(skipped.items())),
+        )
+        write_row(options.work, row)
+    except OSError as err:
+        raise InputError(path, f"cannot be written ({err.strerror})", "make room, then go on with --resume") from err
+    return row
+
+
+def _pairs(
+    shard: ShardPlan,
+    sequence: Sequence,
+    options: Options,
+    totals: Counter[str],
+    skipped: Counter[tuple[str, str]],
+) -> Iterator[AugmentedPair]:
+    """The shard's pairs as they are made; counts what is in them and what was skipped on the way."""
+    frames = tuple(first for first, _ in sequence.pairs)
+    for candidate in stream(shard, frames, options.seed):
+        if totals["pairs"] == shard.quota:
+            return
+        try:
+            made = make_pair(sequence, candidate, options)
+        except InputError as err:
+            if options.stop_on_error:
+                raise
+            entry = skip_entry(err, options.root, 1)
+            skipped[entry["source"], entry["reason"]] += 1
+            continue
+        if made is None:
+            skipped[sequence.name, NO_ROOM] += 1
+            continue
+        pair, scans = made
+        totals.update(_count(pair, scans))
+        yield pair
+
+
+def make_pair(
+    sequence: Sequence, candidate: Candidate, options: Options
+) -> tuple[AugmentedPair, tuple[PreparedScan, PreparedScan]] | None:
+    """One pair with its cars, and its prepared scans; None where the cars found no room.
+
+    Raises:
+        InputError: a source of the pair is unreadable.
+    """
+    config, profile = options.config, options.scanner
+    models = options.models
+    scan0, scan1 = (prepared_scan(sequence, candidate.frame0 + k, profile, config, options.cache)[0] for k in (0, 1))
+    ego, _ = cached_ego_motion(sequence, candidate.frame0, options.cache, (scan0.scan, scan1.scan))
+    pair = read_pair(sequence, candidate.frame0, (scan0.scan, scan1.scan), ego)
+    augmented = augment_pair(pair, models, profile, config, candidate.seed, candidate.pair_id, (scan0, scan1))
+    return None if augmented is None else (augmented, (scan0, scan1))
+
+
+def _count(pair: AugmentedPair, scans: tuple[PreparedScan, PreparedScan]) -> dict[str, int]:
+    """What a pair adds to the totals of the data set."""
+    virtual = [item for item in pair.objects if item.origin == "virtual"]
+    moving = sum(item.speed is not None and abs(item.speed) > 0.0 for item in virtual)
+    both = (pair.scan0, pair.scan1)
+    return {
+        "pairs": 1,
+        "virtual_cars": len(virtual),
+        "moving_virtual_cars": moving,
+        "labelled_objects": len(pair.objects) - len(virtual),
+        "points": sum(len(scan) for scan in both),
+        "simulated_points": sum(int(np.count_nonzero(scan.surface != MEASURED)) for scan in both),
+        "removed_points": sum(len(scan.removed) for scan in both),
+        "invalid_rows": sum(p.scan.rows_in_file - len(p.scan) for p in scans),
+    }

@@ -1,0 +1,275 @@
+"""The `augkitti` command: arguments in, one library call, an exit code out.
+
+0: done; 1: fewer pairs than asked for, or a check found something; 2: bad input, one line on stderr; 130: interrupted.
+Heavy imports stand inside the commands, so that `augkitti --help` answers at once.
+"""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from augkitti.errors import InputError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+config_app = typer.Typer(no_args_is_help=True, help="Every setting of generation.")
+cad_app = typer.Typer(no_args_is_help=True, help="Car models.")
+data_app = typer.Typer(no_args_is_help=True, help="KITTI on disk.")
+app.add_typer(config_app, name="config")
+app.add_typer(cad_app, name="cad")
+app.add_typer(data_app, name="data")
+
+DEFAULT_OUT = Path("augkitti-data")
+
+Kitti = Annotated[
+    Path | None,
+    typer.Option(envvar="AUGKITTI_KITTI", help="Folder with KITTI in it. Without: embedded streets."),
+]
+Out = Annotated[Path, typer.Option(help="Folder of the data set.")]
+Folder = Annotated[Path, typer.Argument(metavar="[OUT]", help="Folder of the data set.", show_default=True)]
+Jobs = Annotated[int, typer.Option(min=1, help="Processes.")]
+Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
+Cad = Annotated[Path | None, typer.Option(help="Folder of car models. Without: cars made in code.")]
+Pairs = Annotated[int, typer.Option("--n", min=1, help="Pairs to make.")]
+Cars = Annotated[str | None, typer.Option(metavar="1-3", help="Virtual cars a pair; 0: plain pairs, labels only.")]
+Categories = Annotated[
+    list[str] | None, typer.Option(help="KITTI categories of virtual cars: Car, Van, Truck; repeat, or commas.")
+]
+MinPoints = Annotated[int | None, typer.Option(help="Returns that each car has at least, in both scans.")]
+Glass = Annotated[Literal["pass", "opaque"] | None, typer.Option(help="Whether panes let the pulse through.")]
+Shutter = Annotated[
+    Literal["rolling", "snapshot"] | None, typer.Option(help="Each ray at its own firing time, or all at once.")
+]
+Profile = Annotated[Path | None, typer.Option(help="Scanner profile (JSON). Without: KITTI's HDL-64E.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings (YAML); see `augkitti config show`.")]
+OnError = Annotated[Literal["skip", "stop"], typer.Option(help="Leave out pairs whose source is unreadable, or stop.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run.")]
+
+
+@contextmanager
+def _answers() -> Iterator[None]:
+    """Bad input: one line on stderr, exit code 2. Interrupted: 130."""
+    for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR"):  # read when numpy is imported, below
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # processes share the work, not threads
+    try:
+        yield
+    except InputError as err:
+        print(f"augkitti: {err}", file=sys.stderr)
+        raise typer.Exit(2) from None
+    except KeyboardInterrupt:
+        print("augkitti: interrupted; finished shards are kept, go on with --resume", file=sys.stderr)
+        raise typer.Exit(130) from None
+    except BrokenPipeError:  # `augkitti ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(0) from None
+
+
+@app.command()
+def generate(
+    kitti: Kitti = None,
+    cad: Cad = None,
+    out: Out = DEFAULT_OUT,
+    n: Pairs = 20,
+    seed: Seed = 0,
+    jobs: Jobs = 1,
+    cars: Cars = None,
+    categories: Categories = None,
+    min_points: MinPoints = None,
+    glass: Glass = None,
+    shutter: Shutter = None,
+    profile: Profile = None,
+    config: ConfigFile = None,
+    on_error: OnError = "skip",
+    resume: Resume = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the plan with disk and time; touch nothing.")
+    ] = False,
+) -> None:
+    """Real scan pairs in, the same with virtual cars and exact motion labels out, as Parquet shards."""
+    with _answers():
+        from pipelines.generate import generate as run
+        from pipelines.run import read_options
+
+        options = read_options(
+            kitti=kitti, cad=cad, out=out, n=n, seed=seed, config=config, profile=profile,
+            stop_on_error=on_error == "stop", cars=_cars(cars), categories=_categories(categories),
+            min_points=min_points, glass=glass, shutter=shutter,
+        )  # fmt: skip
+        raise typer.Exit(run(options, jobs=jobs, resume=resume, dry_run=dry_run))
+
+
+@app.command()
+def prepare(
+    kitti: Kitti = None,
+    cad: Cad = None,
+    out: Out = DEFAULT_OUT,
+    n: Pairs = 20,
+    seed: Seed = 0,
+    jobs: Jobs = 1,
+    cars: Cars = None,
+    categories: Categories = None,
+    min_points: MinPoints = None,
+    glass: Glass = None,
+    shutter: Shutter = None,
+    profile: Profile = None,
+    config: ConfigFile = None,
+    on_error: OnError = "skip",
+    resume: Resume = False,
+) -> None:
+    """Stage 1 of generate. Reads scans and drive files; writes the cache, and the plan to OUT/.augkitti-work."""
+    with _answers():
+        from pipelines.generate import prepare_stage
+        from pipelines.run import read_options
+
+        options = read_options(
+            kitti=kitti, cad=cad, out=out, n=n, seed=seed, config=config, profile=profile,
+            stop_on_error=on_error == "stop", cars=_cars(cars), categories=_categories(categories),
+            min_points=min_points, glass=glass, shutter=shutter,
+        )  # fmt: skip
+        prepare_stage(options, jobs=jobs, resume=resume)
+
+
+@app.command()
+def augment(out: Folder = DEFAULT_OUT, jobs: Jobs = 1) -> None:
+    """Stage 2 of generate. Reads the plan, scans, cache, car models; writes OUT/data/*.parquet and a row for each."""
+    with _answers():
+        from pipelines.generate import augment_stage
+
+        augment_stage(out, jobs=jobs)
+
+
+@app.command()
+def finish(out: Folder = DEFAULT_OUT) -> None:
+    """Stage 3 of generate. Reads the plan and the shards' rows; writes dataset.json and README.md."""
+    with _answers():
+        from pipelines.generate import finish_stage
+
+        raise typer.Exit(finish_stage(out))
+
+
+@app.command()
+def split(
+    out: Folder = DEFAULT_OUT,
+    ratios: Annotated[tuple[float, float, float], typer.Option(help="Train, validation, test.")] = (70.0, 10.0, 20.0),
+    seed: Seed = 0,
+    like: Annotated[Path | None, typer.Option(help="A splits.json whose recordings to follow.")] = None,
+    allow_frames_split: Annotated[
+        bool, typer.Option("--allow-frames-split", help="May divide one recording, with a gap: toy sets only.")
+    ] = False,
+) -> None:
+    """Divide the data set by recording; writes splits.json and the card's header."""
+    with _answers():
+        from pipelines.inspect_set import split_set
+
+        split_set(out, ratios, seed, like, allow_frames_split)
+
+
+@app.command()
+def validate(
+    out: Folder = DEFAULT_OUT,
+    kitti: Kitti = None,
+    jobs: Jobs = 1,
+    json: Annotated[Path | None, typer.Option(help="Write the findings there.")] = None,
+) -> None:
+    """Check every invariant of the contract on every pair."""
+    with _answers():
+        from pipelines.inspect_set import validate_set
+
+        raise typer.Exit(validate_set(out, kitti, jobs, json))
+
+
+@app.command()
+def view(
+    folder: Folder = DEFAULT_OUT,
+    pair: Annotated[str | None, typer.Option(help="Pair id. Without: the first.")] = None,
+    out: Annotated[Path, typer.Option(help="Picture to write (PNG).")] = Path("pair.png"),
+    kitti: Kitti = None,
+) -> None:
+    """Draw a pair: bird's-eye view, range image before and after, each car close up."""
+    with _answers():
+        from pipelines.inspect_set import view_pair
+
+        view_pair(folder, pair, out, kitti)
+
+
+@app.command()
+def info(
+    folder: Folder = DEFAULT_OUT,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Picture to write (PNG).")] = None,
+    kitti: Kitti = None,
+) -> None:
+    """Totals, car points, speeds and yaw rates, beside the labelled motions of real KITTI."""
+    with _answers():
+        from pipelines.inspect_set import show_info
+
+        show_info(folder, json, out, kitti)
+
+
+@app.command()
+def synthesize(
+    out: Out,
+    drives: Annotated[int, typer.Option(min=1, help="Streets.")] = 10,
+    frames: Annotated[int, typer.Option(min=1, help="Scans of each.")] = 40,
+    seed: Seed = 0,
+    jobs: Jobs = 1,
+    profile: Profile = None,
+) -> None:
+    """Write procedural streets, scanned with the shipped profile, in KITTI's raw layout."""
+    with _answers():
+        from pipelines.inspect_set import synthesize_drives
+
+        synthesize_drives(out, drives, frames, seed, jobs, profile)
+
+
+@config_app.command("show")
+def config_show(config: ConfigFile = None) -> None:
+    """Print each key with its value and one line of why; valid YAML."""
+    with _answers():
+        from pipelines.inspect_set import show_config
+
+        show_config(config)
+
+
+@cad_app.command("check")
+def cad_check(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of car models.")],
+    sheet: Annotated[Path | None, typer.Option(help="Contact sheet to write (PNG).")] = None,
+) -> None:
+    """Print what each model of a folder is taken for, and why."""
+    with _answers():
+        from pipelines.inspect_set import check_cad
+
+        raise typer.Exit(check_cad(folder, sheet))
+
+
+@data_app.command("status")
+def data_status(kitti: Kitti = None) -> None:
+    """Compare a disk with the manifest of KITTI: what is there, missing, cut short, what to fetch."""
+    with _answers():
+        from pipelines.inspect_set import show_data_status
+
+        raise typer.Exit(show_data_status(kitti))
+
+
+def _cars(text: str | None) -> tuple[int, int] | None:
+    """`1-3` or `2` as a range."""
+    if text is None:
+        return None
+    first, dash, last = text.partition("-")
+    if not (first.isdecimal() and (last.isdecimal() if dash else True)):
+        raise InputError("--cars", f"`{text}` is no range", "give 1-3, 2 or 0")
+    return int(first), int(last if dash else first)
+
+
+def _categories(names: list[str] | None) -> tuple[str, ...] | None:
+    return tuple(name.strip() for part in names for name in part.split(",") if name.strip()) if names else None
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app()

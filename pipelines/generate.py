@@ -1,0 +1,187 @@
+"""`augkitti generate`: checked options in, the three stages one after another, an exit code out.
+
+Each stage can be run alone: `augkitti prepare`, `augment`, `finish`; they hand over through the work folder.
+"""
+
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+from rich.table import Table
+
+from augkitti.errors import InputError
+from pipelines.augment import augment_all
+from pipelines.finish import finish_set
+from pipelines.plan import ShardPlan
+from pipelines.prepare import prepare_all
+from pipelines.run import Options, Run, check_output, open_run, reopen_run, start_work
+from pipelines.shard_row import ShardRow, read_row
+from pipelines.stage import console
+from pipelines.streets import Streets, make_streets
+
+# Measured on shared real scans with real CAD models, one core; docs/figures.md, "Generation". For --dry-run only.
+BYTES_PER_PAIR = 4.4e6
+BYTES_PER_PREPARED_SCAN = 0.6e6
+BYTES_PER_STREET_SCAN = 1.9e6
+SECONDS_PER_PAIR = 1.0
+SECONDS_PER_PREPARED_SCAN = 0.5
+SECONDS_PER_STREET_SCAN = 1.0
+
+
+def generate(options: Options, jobs: int, resume: bool, dry_run: bool) -> int:
+    """Run all stages, or print the plan.
+
+    Returns:
+        0, or 1 where fewer pairs were made than asked for.
+
+    Raises:
+        InputError: bad input; before any work, except for sources that turn out unreadable with `--on-error stop`.
+    """
+    if dry_run:
+        return show_plan(options, jobs)
+    started = time.monotonic()
+    run = prepare_stage(options, jobs, resume)
+    rows = augment_all(run, jobs)
+    return _close(run, rows, time.monotonic() - started)
+
+
+def prepare_stage(options: Options, jobs: int, resume: bool) -> Run:
+    """Check the input, make the streets if need be, begin the work folder, and fill the cache.
+
+    Raises:
+        InputError: as `generate`.
+    """
+    assert options.models is not None  # bad car models are told before anything is made
+    check_output(options.out, resume)
+    print(_first_line(options), flush=True)
+    if options.streets is not None:
+        make_streets(options.streets, options.scanner, jobs)
+    run = open_run(options)
+    start_work(run, resume)
+    made, kept = prepare_all(
+        run.sequences,
+        run.planned_frames(),
+        options.scanner,
+        options.config,
+        options.cache,
+        jobs,
+        options.stop_on_error,
+    )
+    print(f"prepared: {made} made, {kept} found in {options.cache}", file=sys.stderr)
+    return run
+
+
+def augment_stage(out: Path, jobs: int) -> None:
+    """Make the shards of the plan in `out`'s work folder.
+
+    Raises:
+        InputError: there is no plan, or a source is unreadable and the run is to stop there.
+    """
+    augment_all(reopen_run(out), jobs)
+
+
+def finish_stage(out: Path) -> int:
+    """Write the index and the card.
+
+    Raises:
+        InputError: there is no plan, or a shard is unfinished.
+    """
+    run = reopen_run(out)
+    rows = [read_row(run.options.work, out, shard) for shard in run.shards]
+    there = [row for row in rows if row is not None]
+    if len(there) < len(rows):
+        raise InputError(
+            out, f"{len(rows) - len(there)} of {len(rows)} shards are unfinished", "run `augkitti augment`"
+        )
+    return _close(run, there, None)
+
+
+def _close(run: Run, rows: list[ShardRow], seconds: float | None) -> int:
+    finish_set(run, rows)
+    made = sum(row.pairs for row in rows)
+    _print_totals(run, rows, made, seconds)
+    if made < run.options.n:
+        print(f"short by {run.options.n - made} of {run.options.n} pairs: see the reasons above", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _first_line(options: Options) -> str:
+    streets = options.streets
+    if streets is None:
+        return f"source: KITTI at {options.kitti}"
+    return (
+        f"source: EMBEDDED STREETS, procedural, not real KITTI (no --kitti, no $AUGKITTI_KITTI): "
+        f"{streets.drives} streets of seed {streets.seed}, {'kept' if streets.are_there else 'to be made'} "
+        f"in {streets.folder}"
+    )
+
+
+def _print_totals(run: Run, rows: list[ShardRow], made: int, seconds: float | None) -> None:
+    totals: Counter[str] = Counter()
+    reasons: Counter[str] = Counter()
+    for entry in run.left_out:
+        reasons[entry["reason"]] += entry["count"]
+    for row in rows:
+        totals.update(row.totals)
+        for entry in row.skipped:
+            reasons[entry["reason"]] += entry["count"]
+    entries = [row.entry for row in rows if row.entry is not None]
+    table = Table(title=str(run.options.out), show_header=False, title_justify="left")
+    table.add_row("pairs", f"{made:,} of {run.options.n:,}")
+    table.add_row("shards", f"{len(entries):,}, {sum(entry.bytes for entry in entries) / 1e6:,.1f} MB")
+    table.add_row("virtual cars", f"{totals['virtual_cars']:,}, {totals['moving_virtual_cars']:,} of them moving")
+    table.add_row("points", f"{totals['points']:,}, {totals['simulated_points']:,} of them simulated")
+    table.add_row("points hidden by cars", f"{totals['removed_points']:,}")
+    if totals["invalid_rows"]:
+        table.add_row("rows dropped (NaN or zeros)", f"{totals['invalid_rows']:,}")
+    if seconds is not None:
+        table.add_row("time", f"{seconds:,.1f} s, {made / max(seconds, 1e-9):.2f} pairs/s")
+    for reason, count in sorted(reasons.items()):
+        table.add_row("skipped", f"{count:,} x {reason}")
+    console().print(table)
+
+
+def show_plan(options: Options, jobs: int) -> int:
+    """Print what a run would make, with disk and time; touches nothing."""
+    assert options.models is not None
+    check_output(options.out, resume=True)
+    print(_first_line(options))
+    streets = options.streets
+    if streets is not None and not streets.are_there:
+        scans = streets.drives * streets.frames
+        _print_estimate(options.n, scans, jobs, streets)
+        return 0
+    run = open_run(options)
+    table = Table("sequence", "scan pairs", "pairs to make", "shards", title="plan", title_justify="left")
+    of_sequence: dict[str, list[ShardPlan]] = {}
+    for shard in run.shards:
+        of_sequence.setdefault(shard.sequence, []).append(shard)
+    for name, shards in of_sequence.items():
+        quota = sum(shard.quota for shard in shards)
+        table.add_row(name, f"{len(run.sequences[name].pairs):,}", f"{quota:,}", f"{len(shards):,}")
+    console().print(table)
+    for entry in run.left_out:
+        print(f"left out: {entry['source']}: {entry['reason']} ({entry['count']} pairs)")
+    scans = sum(len({*frames, *(f + 1 for f in frames)}) for frames in run.planned_frames().values())
+    _print_estimate(options.n, scans, jobs, None)
+    return 0
+
+
+def _print_estimate(n: int, scans: int, jobs: int, streets: Streets | None) -> None:
+    seconds = n * SECONDS_PER_PAIR + scans * SECONDS_PER_PREPARED_SCAN
+    cache = scans * BYTES_PER_PREPARED_SCAN
+    if streets is not None:
+        seconds += scans * SECONDS_PER_STREET_SCAN
+        cache += scans * BYTES_PER_STREET_SCAN
+    print(
+        f"{n:,} pairs of {scans:,} scans: about {n * BYTES_PER_PAIR / 1e9:,.2f} GB on disk, {cache / 1e9:,.2f} GB in "
+        f"the cache, {_duration(seconds / jobs)} with --jobs {jobs} (spares not counted; nothing was written)"
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,286 @@
+"""Stage 1, per scan: reads the source's scans and drive files, writes what depends on one scan alone to the cache.
+
+Reads: the planned pairs' `.bin` files, timestamps, OXTS, poses, calibration.
+Writes: `CACHE/prepared/<2 digits>/<digest>.npz`, one file a scan (rays, ground, drivable region) and one a pair
+(ego-motion). A file's name is the digest of all that its content depends on: the scan's bytes and times, the sections
+of the configuration that matter, the scanner profile, the program. So neighbouring pairs, other seeds and other cars
+find what is there, and nothing stale is ever read. Pickle is never loaded; a damaged file is made again.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+import zlib
+from functools import cache, partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from augkitti.augment_pair import prepare_scan
+from augkitti.config import Config
+from augkitti.dataset_index import replace_whole
+from augkitti.ego_motion import EgoMotion
+from augkitti.errors import InputError
+from augkitti.frames import F64, is_rigid
+from augkitti.kitti import (
+    Sequence,
+    ego_motion_digest,
+    read_ego_motion,
+    read_scan,
+    scan_digest,
+)
+from augkitti.scan_pair import NO_TICK, DrivableRegion, GroundMap, PreparedScan, Scan, ScanRays
+from augkitti.scanner import ScannerProfile, fire_rays
+from pipelines.stage import run_tasks
+
+_FORMAT = "prepared 1"
+
+
+def prepare_all(
+    sequences: dict[str, Sequence],
+    frames: dict[str, tuple[int, ...]],
+    profile: ScannerProfile,
+    config: Config,
+    cache_folder: Path,
+    jobs: int,
+    stop: bool,
+) -> tuple[int, int]:
+    """Fill the cache for the pairs that begin at `frames` of each sequence.
+
+    Args:
+        sequences: by name.
+        frames: first frames of the planned pairs, by sequence name.
+        profile: the scanner.
+        config: its `ground` and `drivable` sections matter.
+        cache_folder: where to keep results.
+        jobs: processes.
+        stop: let the first unreadable scan end the run; else `augment` meets it again, leaves it out and lists it.
+
+    Returns:
+        How many files were made and how many were there already.
+    """
+    made = kept = 0
+    scans = [(sequences[s], f) for s in sorted(frames) for f in sorted({*frames[s], *(f + 1 for f in frames[s])})]
+    pairs = [(sequences[s], f) for s in sorted(frames) for f in frames[s]]
+    for work, items, what in ((_scan_task, scans, "scans"), (_pair_task, pairs, "ego-motions")):
+        task = partial(work, profile=profile, config=config, cache_folder=cache_folder, stop=stop)
+        for new in run_tasks(task, items, jobs, what, weight=lambda item: 1):
+            made, kept = made + new, kept + (not new)
+    return made, kept
+
+
+def _scan_task(
+    item: tuple[Sequence, int], profile: ScannerProfile, config: Config, cache_folder: Path, stop: bool
+) -> bool:
+    try:
+        return prepared_scan(*item, profile, config, cache_folder)[1]
+    except InputError:
+        if stop:
+            raise
+        return False
+
+
+def _pair_task(
+    item: tuple[Sequence, int], profile: ScannerProfile, config: Config, cache_folder: Path, stop: bool
+) -> bool:
+    sequence, frame0 = item
+    try:
+        return cached_ego_motion(sequence, frame0, cache_folder)[1]
+    except InputError:
+        if stop:
+            raise
+        return False
+
+
+def prepared_scan(
+    sequence: Sequence, frame: int, profile: ScannerProfile, config: Config, cache_folder: Path
+) -> tuple[PreparedScan, bool]:
+    """A prepared scan from the cache, or made and put there; and whether it was made.
+
+    Raises:
+        InputError: the scan is unreadable.
+    """
+    sections = {"ground": config.ground.model_dump(mode="json"), "drivable": config.drivable.model_dump(mode="json")}
+    path = _cache_path(cache_folder, ["scan", scan_digest(sequence, frame), sections, profile.digest])
+    scan = read_scan(sequence, frame)
+    content = _load(path)
+    if content is not None:
+        try:
+            return _unpack(content, scan, profile), False
+        except (KeyError, ValueError, IndexError, TypeError):
+            pass  # damaged or foreign: made again below
+    prepared = prepare_scan(scan, profile, config)
+    _store(path, _pack(prepared))
+    return prepared, True
+
+
+def cached_ego_motion(
+    sequence: Sequence, frame0: int, cache_folder: Path, scans: tuple[Scan, Scan] | None = None
+) -> tuple[EgoMotion, bool]:
+    """A pair's ego-motion from the cache, or found and put there; and whether it was found now.
+
+    Raises:
+        InputError: a scan or a file of the drive is unreadable.
+    """
+    path = _cache_path(cache_folder, ["ego-motion", ego_motion_digest(sequence, frame0)])
+    content = _load(path)
+    if content is not None:
+        T = content.get("T_velo1_velo0")
+        source = str(content.get("source"))
+        if T is not None and source in ("oxts", "poses", "registration", "truth") and is_rigid(T, 1e-9):
+            return EgoMotion(T, source), False  # type: ignore[arg-type]
+    scan0, scan1 = scans or (read_scan(sequence, frame0), read_scan(sequence, frame0 + 1))
+    motion = read_ego_motion(sequence, frame0, scan0, scan1)
+    _store(path, {"T_velo1_velo0": motion.T_velo1_velo0, "source": np.array(motion.source)})
+    return motion, True
+
+
+@cache
+def _program_digest() -> str:
+    """sha256 over the library's own source: another program never reads this one's cache."""
+    digest = hashlib.sha256()
+    for entry in sorted(resources.files("augkitti").iterdir(), key=lambda entry: entry.name):
+        if entry.name.endswith(".py"):
+            digest.update(entry.name.encode() + entry.read_bytes())
+    return digest.hexdigest()
+
+
+def _cache_path(cache_folder: Path, parts: list[Any]) -> Path:
+    key = hashlib.sha256(json.dumps([_FORMAT, _program_digest(), *parts], sort_keys=True).encode()).hexdigest()
+    return cache_folder / "prepared" / key[:2] / f"{key}.npz"
+
+
+def _load(path: Path) -> dict[str, Any] | None:
+    """The arrays of a cache file; None where there is none, or none that can be read."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+        return None
+
+
+def _store(path: Path, arrays: dict[str, Any]) -> None:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_whole(path, lambda file: file.write(buffer.getvalue()))
+    except OSError as err:
+        raise InputError(path.parent, f"the cache cannot be written ({err.strerror})", "set AUGKITTI_CACHE") from err
+
+
+def _pack(prepared: PreparedScan) -> dict[str, Any]:
+    """The few arrays that a prepared scan can be rebuilt from; points come from the scan itself."""
+    rays, ground, region = prepared.rays, prepared.ground, prepared.region
+    packed: dict[str, Any] = {
+        "ring": rays.ring,
+        "plane": ground.plane,
+        "ground_grid": np.array([*ground.origin_m, ground.cell_m]),
+        "height_m": ground.height_m,
+        "observed": np.packbits(ground.observed),
+        "is_ground": np.packbits(ground.is_ground),
+        "region_grid": np.array([*region.origin_m, region.cell_m, region.road_heading_rad]),
+        "drivable_shape": np.array(region.drivable.shape),
+        "drivable": np.packbits(region.drivable),
+    }
+    if prepared.scan.kind == "raw":  # rays are fired ticks times beams, and the stray points' own
+        on_lattice = rays.ray_tick != NO_TICK
+        stray = ~on_lattice
+        packed |= {
+            "tick": rays.tick,
+            "fired": np.unique(rays.ray_tick[on_lattice]),
+            "stray_azimuth_rad": rays.ray_azimuth_rad[stray],
+            "stray_elevation_rad": rays.ray_elevation_rad[stray],
+            "stray_time_s": rays.ray_time_s[stray],
+        }
+    else:
+        packed |= {
+            "ray": rays.ray,
+            "ray_ring": rays.ray_ring,
+            "ray_azimuth_rad": rays.ray_azimuth_rad,
+            "ray_elevation_rad": rays.ray_elevation_rad,
+            "ray_blind": np.packbits(rays.ray_blind),
+        }
+    return packed
+
+
+def _unpack(packed: dict[str, Any], scan: Scan, profile: ScannerProfile) -> PreparedScan:
+    if len(packed["ring"]) != len(scan):
+        raise ValueError("of another scan")
+    rays = _raw_rays(packed, scan, profile) if scan.kind == "raw" else _compensated_rays(packed, scan)
+    shape = packed["height_m"].shape
+    x, y, cell = (float(value) for value in packed["ground_grid"])
+    ground = GroundMap(
+        plane=packed["plane"],
+        origin_m=(x, y),
+        cell_m=cell,
+        height_m=packed["height_m"],
+        observed=_bits(packed["observed"], shape),
+        is_ground=_bits(packed["is_ground"], (len(scan),)),
+    )
+    x, y, cell, heading = (float(value) for value in packed["region_grid"])
+    rows, columns = (int(value) for value in packed["drivable_shape"])
+    return PreparedScan(
+        scan, rays, ground, DrivableRegion((x, y), cell, _bits(packed["drivable"], (rows, columns)), heading)
+    )
+
+
+def _raw_rays(packed: dict[str, Any], scan: Scan, profile: ScannerProfile) -> ScanRays:
+    ring, tick, fired = packed["ring"], packed["tick"], packed["fired"]
+    lattice = fire_rays(profile, fired, scan.period_s)
+    stray = np.flatnonzero(tick == NO_TICK)
+    on_lattice = np.flatnonzero(tick != NO_TICK)
+    ray = np.empty(len(scan), dtype=np.int32)
+    ray[on_lattice] = ring[on_lattice].astype(np.int64) * len(fired) + np.searchsorted(fired, tick[on_lattice])
+    ray[stray] = len(lattice) + np.arange(len(stray))
+    ray_point = np.full(len(lattice) + len(stray), -1, dtype=np.int32)
+    ray_point[ray] = np.arange(len(scan), dtype=np.int32)
+
+    def joined(of_lattice: Any, of_stray: Any) -> Any:
+        if len(of_stray) != len(stray):
+            raise ValueError("stray rays and stray points differ in number")
+        return np.concatenate([of_lattice, of_stray])
+
+    return ScanRays(
+        ring=ring,
+        tick=tick,
+        ray=ray,
+        ray_ring=joined(lattice.ray_ring, ring[stray]),
+        ray_tick=joined(lattice.ray_tick, tick[stray]),
+        ray_azimuth_rad=joined(lattice.ray_azimuth_rad, packed["stray_azimuth_rad"]),
+        ray_elevation_rad=joined(lattice.ray_elevation_rad, packed["stray_elevation_rad"]),
+        ray_time_s=joined(lattice.ray_time_s, packed["stray_time_s"]),
+        ray_point=ray_point,
+        ray_blind=joined(lattice.ray_blind, np.zeros(len(stray), dtype=bool)),
+    )
+
+
+def _compensated_rays(packed: dict[str, Any], scan: Scan) -> ScanRays:
+    ray_ring, azimuth = packed["ray_ring"], packed["ray_azimuth_rad"]
+    ray_point = np.full(len(ray_ring), -1, dtype=np.int32)
+    ray_point[packed["ray"]] = np.arange(len(scan), dtype=np.int32)
+    elevation: F64 = packed["ray_elevation_rad"]
+    if not len(ray_ring) == len(azimuth) == len(elevation):
+        raise ValueError("columns of rays differ in length")
+    return ScanRays(
+        ring=packed["ring"],
+        tick=np.full(len(scan), NO_TICK, dtype=np.uint16),
+        ray=packed["ray"],
+        ray_ring=ray_ring,
+        ray_tick=np.full(len(ray_ring), NO_TICK, dtype=np.uint16),
+        ray_azimuth_rad=azimuth,
+        ray_elevation_rad=elevation,
+        ray_time_s=np.zeros(len(ray_ring)),
+        ray_point=ray_point,
+        ray_blind=_bits(packed["ray_blind"], (len(ray_ring),)),
+    )
+
+
+def _bits(packed: Any, shape: tuple[int, ...]) -> Any:
+    count = int(np.prod(shape))
+    if len(packed) != (count + 7) // 8:
+        raise ValueError("bits of another size")
+    return np.unpackbits(packed, count=count).astype(bool).reshape(shape)
