@@ -50,7 +50,7 @@ def mean_by_cell(flat: I64, values: Array, cells: int) -> tuple[F64, F64]:
     """Mean value (0 where there is none) and number of points of every cell (cells,)."""
     count = np.bincount(flat, minlength=cells).astype(np.float64)
     total = np.bincount(flat, weights=values, minlength=cells)
-    return total / np.maximum(count, 1.0), count
+    return np.asarray(total / np.maximum(count, 1.0), dtype=np.float64), count
 
 
 def fill_smoothly(values: F64, weight: F64, prior_weight: float, levels: int, beyond: float = 0.0) -> F64:

@@ -22,18 +22,18 @@ class _Section(BaseModel):
 class GroundConfig(_Section):
     """Ground plane and local height map (`ground.py`)."""
 
-    cell_m: float = Field(0.5, gt=0.1, le=2.0, description="cell of the height map")
-    reach_m: float = Field(68.0, ge=20.0, le=120.0, description="how far the height map goes each way")
-    min_height_m: float = Field(1.2, gt=0.0, description="the plane lies at least this far under the sensor")
-    max_height_m: float = Field(2.5, gt=0.0, description="the plane lies at most this far under the sensor")
-    usual_height_m: float = Field(1.73, gt=0.0, description="KITTI's sensor height, used only where no ground is seen")
-    max_tilt_rad: float = Field(0.10, gt=0.0, le=0.3, description="steepest plane against the sensor; a wall never")
-    plane_radius_m: float = Field(20.0, ge=8.0, description="points within it fit the plane")
-    inlier_m: float = Field(0.10, gt=0.0, description="distance from the plane at which a point has no say any more")
-    ransac_tries: int = Field(300, ge=10, description="triples that RANSAC tries, drawn with a fixed seed")
-    step_m: float = Field(0.25, gt=0.0, description="a cell this much above its surroundings' lowest is not ground")
-    above_m: float = Field(0.12, gt=0.0, description="points up to this above the map are ground (near; twice it far)")
-    below_m: float = Field(0.30, gt=0.0, description="points down to this below the map are ground")
+    cell_m: float = Field(default=0.5, gt=0.1, le=2.0, description="cell of the height map")
+    reach_m: float = Field(default=68.0, ge=20.0, le=120.0, description="how far the height map goes each way")
+    min_height_m: float = Field(default=1.2, gt=0.0, description="the plane lies at least this far under the sensor")
+    max_height_m: float = Field(default=2.5, gt=0.0, description="the plane lies at most this far under the sensor")
+    usual_height_m: float = Field(default=1.73, gt=0.0, description="KITTI's sensor height, used only where no ground is seen")
+    max_tilt_rad: float = Field(default=0.10, gt=0.0, le=0.3, description="steepest plane against the sensor; a wall never")
+    plane_radius_m: float = Field(default=20.0, ge=8.0, description="points within it fit the plane")
+    inlier_m: float = Field(default=0.20, gt=0.0, description="distance from the plane at which a point has no say any more")
+    ransac_tries: int = Field(default=300, ge=10, description="triples that RANSAC tries, drawn with a fixed seed")
+    step_m: float = Field(default=0.25, gt=0.0, description="a cell this much above its surroundings' lowest is not ground")
+    above_m: float = Field(default=0.12, gt=0.0, description="points up to this above the map are ground (near; twice it far)")
+    below_m: float = Field(default=0.30, gt=0.0, description="points down to this below the map are ground")
 
 
 class DrivableConfig(_Section):

@@ -96,10 +96,9 @@ def _fit_plane(p: F64, config: GroundConfig) -> F64:
     q, flat = q[low], flat[low]
     level = np.array([0.0, 0.0, -config.usual_height_m])
     if len(q) >= 10:
-        mean_x, count = mean_by_cell(flat, q[:, 0], cells * cells)
-        seen = count > 0
+        seen = np.bincount(flat, minlength=cells * cells) > 0
         x, y, z = (mean_by_cell(flat, q[:, k], cells * cells)[0][seen] for k in range(3))
-        weight = np.exp(-0.5 * ((x / 12.0) ** 2 + (y / 4.0) ** 2))
+        weight = np.exp(-0.5 * ((x / 10.0) ** 2 + (y / 4.0) ** 2))
         level = _ransac(x, y, z, weight, level, config)
     normal = np.array([-level[0], -level[1], 1.0])
     return np.append(normal, -level[2]) / np.sqrt((normal * normal).sum())
@@ -129,7 +128,7 @@ def _ransac(x: F64, y: F64, z: F64, weight: F64, level: F64, config: GroundConfi
         best = _weighted_plane(x, y, z, trust, best)
     steep = float(np.hypot(best[0], best[1]))
     bounded = steep < steepest and config.min_height_m < -best[2] < config.max_height_m
-    return best if bounded else level
+    return np.asarray(best if bounded else level, dtype=np.float64)
 
 
 def _weighted_plane(x: F64, y: F64, z: F64, weight: F64, otherwise: F64) -> F64:
