@@ -35,7 +35,7 @@ class CarHits:
     cos_incidence: F64  # (K, L) between 0 (grazing) and 1
 
 
-class _Structure:
+class MeshCaster:
     """Embree's acceleration structure of one mesh, and what is needed to work out ranges in float64."""
 
     def __init__(self, vertices: F64, faces: I32) -> None:
@@ -60,12 +60,12 @@ class _Structure:
         return face, np.where(hit, np.maximum(along, 0.0), np.inf), np.where(hit, np.abs(falling), 0.0)
 
 
-_structures: WeakKeyDictionary[CarModel, _Structure] = WeakKeyDictionary()
+_structures: WeakKeyDictionary[CarModel, MeshCaster] = WeakKeyDictionary()
 
 
-def _structure(model: CarModel) -> _Structure:
+def _structure(model: CarModel) -> MeshCaster:
     if model not in _structures:
-        _structures[model] = _Structure(model.vertices, model.faces)
+        _structures[model] = MeshCaster(model.vertices, model.faces)
     return _structures[model]
 
 
