@@ -6,9 +6,9 @@ page of the documentation.
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import uuid4
 
 import numpy as np
@@ -118,12 +118,12 @@ def shard_metadata(config: Config, profile: ScannerProfile, models: Iterable[Car
     """What every shard of a data set says of how it was made; the scanner profile is carried whole."""
     return {
         "contract": CONTRACT_VERSION,
-        "version": __version__,
-        "config": config.model_dump(mode="json"),
-        "config_digest": config.digest(),
-        "profile": profile.content,
-        "profile_digest": profile.digest,
-        "models": {model.name: model.digest for model in sorted(models, key=lambda model: model.name)},
+        "program_version": __version__,
+        "configuration": config.model_dump(mode="json"),
+        "configuration_digest": config.digest(),
+        "scanner_profile": profile.content,
+        "scanner_profile_digest": profile.digest,
+        "cad_models": {model.name: model.digest for model in sorted(models, key=lambda model: model.name)},
     }
 
 
@@ -145,34 +145,37 @@ def write_shard(path: Path, pairs: Iterable[AugmentedPair], metadata: Mapping[st
     text = json.dumps(dict(metadata), sort_keys=True, separators=(",", ":"), allow_nan=False)
     schema = SCHEMA.with_metadata({METADATA_KEY: text.encode()})
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.parent / f".{path.name}.{os.getpid()}.{uuid4().hex[:8]}.tmp"
     seen: set[str] = set()
-    sequence = None
+
+    def write(file: BinaryIO) -> None:
+        options = {"compression": "zstd", "compression_level": 1, "write_statistics": _FLAT}
+        encodings = {"use_dictionary": _DICTIONARY, "column_encoding": _ENCODING}
+        sequence = None
+        with pq.ParquetWriter(file, schema, **options, **encodings) as writer:
+            for pair in pairs:
+                sequence = sequence or pair.sequence
+                if pair.pair_id in seen or pair.sequence != sequence:
+                    raise ValueError(f"{path.name}: {pair.pair_id} is there already, or of another sequence")
+                seen.add(pair.pair_id)
+                writer.write_table(to_table(pair, schema))
+        if not seen:
+            raise ValueError(f"{path.name}: a shard needs at least one pair")
+
+    replace_whole(path, write)
+    return len(seen)
+
+
+def replace_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
+    """Let `write` fill a temporary file beside `path`, then rename it: the file is there whole or not at all."""
+    temporary = path.parent / f".{path.name}.{os.getpid()}.{uuid4().hex[:8]}.tmp"
     try:
         with temporary.open("xb") as file:
-            with pq.ParquetWriter(
-                file,
-                schema,
-                compression="zstd",
-                compression_level=1,
-                use_dictionary=_DICTIONARY,
-                column_encoding=_ENCODING,
-                write_statistics=_FLAT,
-            ) as writer:
-                for pair in pairs:
-                    sequence = sequence or pair.sequence
-                    if pair.pair_id in seen or pair.sequence != sequence:
-                        raise ValueError(f"{path.name}: {pair.pair_id} is there already, or of another sequence")
-                    seen.add(pair.pair_id)
-                    writer.write_table(to_table(pair, schema))
-            if not seen:
-                raise ValueError(f"{path.name}: a shard needs at least one pair")
+            write(file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-    return len(seen)
 
 
 def to_table(pair: AugmentedPair, schema: pa.Schema = SCHEMA) -> pa.Table:
@@ -291,6 +294,14 @@ def read_pair_ids(path: Path) -> list[str]:
     with file:
         names: list[str] = _read(path, lambda: file.read(columns=["pair_id"])).column("pair_id").to_pylist()
         return names
+
+
+def read_frames(path: Path) -> list[tuple[int, int]]:
+    """`frame0` and `frame1` of a shard's pairs in order; errors as `open_shard`."""
+    file, _ = open_shard(path)
+    with file:
+        table = _read(path, lambda: file.read(columns=["frame0", "frame1"]))
+    return list(zip(table.column("frame0").to_pylist(), table.column("frame1").to_pylist(), strict=True))
 
 
 def _row_group(file: pq.ParquetFile, path: Path, row: int) -> AugmentedPair:
