@@ -29,7 +29,6 @@ for sequence in kitti.open_root(sys.argv[1]).sequences:
             steps.append(np.linalg.norm(known.T_velo1_velo0[:3, 3]) / (scan1.time_s - scan0.time_s))
     if differences:
         (rms_cm, rms_deg), (max_cm, max_deg) = np.sqrt(np.mean(np.square(differences), 0)), np.max(differences, 0)
-        print(
-            f"| {sequence.name} | {len(differences)} | {np.mean(steps):.1f} | {known.source} |"
-            f" {rms_cm:.1f} | {max_cm:.1f} | {rms_deg:.3f} | {max_deg:.3f} | {', '.join(sorted(used))} | {1000 * np.median(seconds):.0f} |"
-        )
+        fields = [sequence.name, len(differences), f"{np.mean(steps):.1f}", known.source, f"{rms_cm:.1f}"]
+        fields += [f"{max_cm:.1f}", f"{rms_deg:.3f}", f"{max_deg:.3f}", ", ".join(sorted(used))]
+        print("|", " | ".join(map(str, [*fields, f"{1000 * np.median(seconds):.0f}"])), "|")
