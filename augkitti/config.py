@@ -26,18 +26,26 @@ class GroundConfig(_Section):
     reach_m: float = Field(default=68.0, ge=20.0, le=120.0, description="how far the height map goes each way")
     min_height_m: float = Field(default=1.2, gt=0.0, description="the plane lies at least this far under the sensor")
     max_height_m: float = Field(default=2.5, gt=0.0, description="the plane lies at most this far under the sensor")
-    usual_height_m: float = Field(default=1.73, gt=0.0, description="KITTI's sensor height, used only where no ground is seen")
-    max_tilt_rad: float = Field(default=0.10, gt=0.0, le=0.3, description="steepest plane against the sensor; a wall never")
+    usual_height_m: float = Field(default=1.73, gt=0.0, description="sensor height where no ground is seen")
+    max_tilt_rad: float = Field(default=0.10, gt=0.0, le=0.3, description="steepest plane against the sensor")
     plane_radius_m: float = Field(default=20.0, ge=8.0, description="points within it fit the plane")
-    inlier_m: float = Field(default=0.20, gt=0.0, description="distance from the plane at which a point has no say any more")
+    inlier_m: float = Field(default=0.20, gt=0.0, description="farther points have no say in the plane")
     ransac_tries: int = Field(default=300, ge=10, description="triples that RANSAC tries, drawn with a fixed seed")
-    step_m: float = Field(default=0.25, gt=0.0, description="a cell this much above its surroundings' lowest is not ground")
-    above_m: float = Field(default=0.12, gt=0.0, description="points up to this above the map are ground (near; twice it far)")
+    step_m: float = Field(default=0.25, gt=0.0, description="a cell this much above its surroundings is no ground")
+    above_m: float = Field(default=0.12, gt=0.0, description="points up to this above the map are ground; twice it far")
     below_m: float = Field(default=0.30, gt=0.0, description="points down to this below the map are ground")
 
 
 class DrivableConfig(_Section):
     """Where a car may stand (`drivable.py`)."""
+
+    cell_m: float = Field(default=0.2, ge=0.1, le=1.0, description="cell of the grid")
+    reach_m: float = Field(default=62.0, ge=20.0, le=120.0, description="how far the grid goes each way")
+    low_m: float = Field(default=0.25, gt=0.0, description="what rises higher over the ground is an obstacle")
+    car_height_m: float = Field(default=2.0, gt=0.0, description="what hangs higher over the ground is none")
+    pass_m: float = Field(default=0.6, gt=0.0, description="a ray lower than this over a gap shows the gap free")
+    kerb_m: float = Field(default=0.04, gt=0.0, description="steps of the ground that a car on the road does not cross")
+    half_width_m: float = Field(default=0.9, gt=0.0, description="half of the width that a car needs")
 
 
 class MoversConfig(_Section):

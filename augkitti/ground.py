@@ -57,14 +57,14 @@ def fit_ground(xyz: F32, config: GroundConfig) -> GroundMap:
 
 def height_at(ground: GroundMap, xy: Array) -> F64:
     """Height z (M,) metres of the ground at places (M, 2): bilinear, held constant beyond the map's edge."""
-    xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+    xy = np.atleast_2d(np.asarray(xy, dtype=np.float64))[:, :2]
     x0, y0 = ground.origin_m
     return interpolate(ground.height_m, (xy[:, 0] - x0) / ground.cell_m, (xy[:, 1] - y0) / ground.cell_m)
 
 
 def normal_at(ground: GroundMap, xy: Array, base_m: float = 1.5) -> F64:
     """Unit normals (M, 3) of the ground at places (M, 2), from heights `base_m` to each side, as wheels feel them."""
-    xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+    xy = np.atleast_2d(np.asarray(xy, dtype=np.float64))[:, :2]
     x0, y0 = ground.origin_m
     margin = base_m + ground.cell_m  # beyond the edge the slope is that of the edge
     size = np.array(ground.height_m.shape) * ground.cell_m
