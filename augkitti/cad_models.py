@@ -20,6 +20,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from augkitti.cad_alignment import Wheel, axles, contact_axles, face_components, find_wheels, merge_vertices
+from augkitti.cad_arches import find_arches
+from augkitti.cad_axes import Cues, find_unit, forward_sign, forward_votes, level_axes
 from augkitti.cad_formats import MODEL_SUFFIXES, SOLID, RawModel, inside, read_model
 from augkitti.errors import InputError
 from augkitti.frames import F64
@@ -27,6 +29,7 @@ from augkitti.scan_pair import GLASS, LAMP, OTHER, PAINT, TYRE, U8, Bool, CarMod
 
 LOADER_VERSION = 1  # part of the cache key: raise it when a file would come out differently
 Vector = tuple[float, float, float]
+BACKWARDS_VOTE = 1.0  # votes against a declared front that are worth a warning
 CATEGORY_OF_CLASS = {
     "car": "Car",
     "suv": "Car",
@@ -44,6 +47,10 @@ _LAMP_NAME = re.compile(
     re.I,
 )
 _GLASS_NAME = re.compile(r"glass|window(?!.?(trim|frame|seal))|windshield|windscreen|vitre|scheibe|pane(?![a-z])", re.I)
+_FRONT_NAME = re.compile(
+    r"(?<![a-z])front|head.?(light|lamp|lt)|windshield|windscreen|steer|bonnet|hood|_F[LR]?(?![a-z])"
+)
+_REAR_NAME = re.compile(r"(?<![a-z])rear|tail|brake.?(light|lamp|lt)|exhaust|trunk|boot(?![a-z])|_[BR][LR](?![a-z])")
 _PANE_NAME = re.compile(r"window(?!.?(trim|frame|seal))|windshield|windscreen", re.I)
 _OTHER_NAME = re.compile(
     r"interior|interieur|seat|siege|dash|steer|under|dessous|chrome|plastic|void|grill|trim|rim|wheel|chassis|engine|"
@@ -214,7 +221,7 @@ def _candidates(folder: Path) -> list["_Candidate | CadDecision"]:
         parts = path.relative_to(root).parts
         groups.setdefault(root / parts[0] if len(parts) > 1 else root, []).append(path)
     for group, paths in sorted(groups.items()):
-        bodies = [p for p in paths if not _WHEEL_NAME.search(p.stem)] or paths
+        bodies = [p for p in paths if not _is_wheel_file(p)] or paths
         wheels = tuple(p for p in paths if p not in bodies)
         for path in bodies:
             name = group.name if len(bodies) == 1 and group != root else path.stem
@@ -223,6 +230,12 @@ def _candidates(folder: Path) -> list["_Candidate | CadDecision"]:
             names.add(name)
             found.append(_from_file(root, group, name, path, wheels, len(bodies)))
     return found
+
+
+def _is_wheel_file(path: Path) -> bool:
+    """By name; `car_no_wheels` is a body."""
+    without = re.search(r"(no|without|ohne|sans).?(wheel|tire|tyre)", path.stem, re.I)
+    return bool(_WHEEL_NAME.search(path.stem)) and not without
 
 
 def _covered(root: Path, candidate: "_Candidate | CadDecision") -> list[Path]:
@@ -351,6 +364,8 @@ def build_model(
         ends = contact_axles(soup.vertices, soup.faces)
         if ends is not None:
             said.append(f"axles at {ends[0]:.2f} and {ends[1]:.2f} m, where it touches the ground")
+        elif not facts_source:
+            raise InputError(path, "no wheels on which it stands", "give wheel_files and wheel_centres_m in a sidecar")
         else:
             ends = (0.3 * float(size[0]), -0.3 * float(size[0]))
             said.append("no axles found: wheelbase taken as 0.6 of the length")
@@ -381,7 +396,8 @@ def finished_model(
     """A `CarModel` with its vertices merged and centred on its bounding box, and its digest taken."""
     vertices, faces = merge_vertices(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int32))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    vertices = vertices - (low + high) / 2.0
+    # a nanometre grid hides the last bits, in which processors differ
+    vertices = np.round(vertices - (low + high) / 2.0, 9)
     model = CarModel(
         name,
         category,
@@ -406,17 +422,45 @@ def _content_digest(model: CarModel) -> str:
 
 
 def _axes(path: Path, raw: RawModel, facts: ModelFacts, source: str) -> tuple[F64, float, list[str]]:
-    """Rotation (3, 3) from file to car axes, metres per file unit, and what was decided."""
-    if facts.up_axis is None or facts.forward_axis is None or facts.unit_scale is None:
-        raise InputError(path, "axes are not given", "give up_axis, forward_axis and unit_scale in a sidecar")
-    up, forward, scale = np.array(facts.up_axis), np.array(facts.forward_axis), facts.unit_scale
-    said = [f"axes and unit ({scale:g} m): {source}"]
+    """Rotation (3, 3) from file to car axes, metres per file unit, and what was decided: by the facts, else found."""
+    if facts.up_axis is not None and facts.forward_axis is not None:
+        R, said = _given_axes(path, facts.up_axis, facts.forward_axis), [f"axes: {source}"]
+    else:
+        R, said = level_axes(raw.vertices, raw.faces, facts.up_axis or raw.up_axis)
+    level = _as_soup(raw, R, 1.0)
+    level = _kept(level, ~(_shadow_planes(level) | _matches(level, facts.drop_materials)))
+    if not len(level.faces):
+        raise InputError(path, "is nothing but a flat plane", "export the whole vehicle")
+    low, high = _bounds(level)
+    if facts.unit_scale is not None:
+        scale, why = facts.unit_scale, f"unit {facts.unit_scale:g} m: {source}"
+    else:
+        scale, why = find_unit(high - low, raw.unit_m)
+    said.append(why)
+    clear = np.asarray(level.opacity < SOLID)
+    front, rear = _of_names(level, _FRONT_NAME), _of_names(level, _REAR_NAME)
+    cues = Cues(clear if clear.any() else _of_materials(level, _GLASS_NAME), _red(level), front & ~rear, rear & ~front)
+    centred = (level.vertices - (low + high) / 2.0) * scale
+    wheels = find_wheels(centred, level.faces, _of_names(level, _WHEEL_NAME))
+    votes = forward_votes(centred, level.faces, cues, axles(wheels) or contact_axles(centred, level.faces))
+    if facts.forward_axis is None:
+        sign, why = forward_sign(path, votes)
+        R = np.diag([sign, sign, 1.0]) @ R
+        said.append(why)
+    elif sum(v for _, v in votes) < -BACKWARDS_VOTE:
+        against = ", ".join(f"{cue} {-value:+.2f}" for cue, value in votes)
+        said.append(f"WARNING: its shape says that it faces the other way than declared ({against})")
+    return R, scale, said
+
+
+def _given_axes(path: Path, up_axis: Vector, forward_axis: Vector) -> F64:
+    up, forward = np.array(up_axis), np.array(forward_axis)
     forward = forward - up * (forward * up).sum() / max((up * up).sum(), 1e-12)
     lengths = np.sqrt((up * up).sum()), np.sqrt((forward * forward).sum())
     if min(lengths) < 1e-3:
         raise InputError(path, "up_axis and forward_axis are zero or parallel", "mend them")
     up, forward = up / lengths[0], forward / lengths[1]
-    return np.stack([forward, np.cross(up, forward), up]), float(scale), said
+    return np.stack([forward, np.cross(up, forward), up])
 
 
 def _turned(vertices: F64, R: F64) -> F64:
@@ -477,9 +521,15 @@ def _with_wheels(
         centres = _turned(np.array(facts.wheel_centres_m), R)
         said.append(f"{len(centres)} wheels placed from files")
     else:
+        low_body, high_body = _bounds(body)
+        shift = np.array([0.0, (low_body + high_body)[1] / 2.0, 0.0])
+        centres, why = find_arches(body.vertices - shift, body.faces, float(extent[2]) / 2.0, float(extent[1]))
+        centres = centres + shift
+        said.append("4 wheels from files placed in the body's wheel arches")
+    if not len(centres):
         raise InputError(
             path,
-            "its wheels are in separate files and nothing says where they belong",
+            f"its wheels are in separate files and nothing says where they belong ({why})",
             "give wheel_centres_m in a sidecar",
         )
     lateral = centres[:, 1].mean()
@@ -666,10 +716,10 @@ def _found_glass(soup: _Soup, middle: F64, clear: Bool, size: F64, wheels: Bool)
     """Windows without a manifest: translucent faces at cabin height that are not lamps; by name where none is declared.
 
     A material is judged as a whole; one whose opacity is an image's holds panes and lamps alike and is judged piece by
-    piece. Cabin height is above 45 % of the car's, where no head lamp and few tail lamps reach.
+    piece. Cabin height is the upper half, where head lamps and most tail lamps do not reach.
     """
     area = face_areas(soup.vertices, soup.faces)
-    high = middle[:, 2] > -0.05 * size[2]
+    high = middle[:, 2] > 0.0
     lamp = _of_names(soup, _LAMP_NAME) & ~_of_names(soup, _PANE_NAME)
     group = soup.material.astype(np.int64)
     shared = (
