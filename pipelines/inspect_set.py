@@ -1,6 +1,7 @@
 """The commands that look: a data set, a folder of car models or a disk in; tables, pictures and exit codes out."""
 
 import json
+import sys
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,10 +10,14 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from rich.table import Table
 
-from augkitti.config import load_config
+from augkitti.config import Config, load_config
+from augkitti.dataset_index import DatasetIndex
+from augkitti.dataset_info import Motions
 from augkitti.errors import InputError
+from augkitti.scanner import ScannerProfile
 from pipelines.run import cache_folder
 from pipelines.stage import console
+from pipelines.streets import make_streets, streets_of
 
 
 def show_config(path: Path | None) -> None:
@@ -109,3 +114,153 @@ def show_data_status(kitti: Path | None) -> int:
         for address in addresses:
             print(f"  {address}")
     return 1 if any(row.state == "damaged" for row in rows) else 0
+
+
+def split_set(
+    out: Path, ratios: tuple[float, float, float], seed: int, like: Path | None, allow_frames_split: bool
+) -> None:
+    """Divide a data set by recording and print what went where.
+
+    Raises:
+        InputError: unfinished set, no ratios, too few recordings, or recordings that `like` lacks.
+    """
+    from augkitti.dataset_index import read_index
+    from augkitti.splits import pairs_by_split, split_dataset
+
+    try:
+        splits = split_dataset(out, ratios, seed, like, allow_frames_split)
+    except OSError as err:
+        raise InputError(out, f"cannot be written ({err.strerror})", "check its permissions") from err
+    index = read_index(out)
+    counts = pairs_by_split(index, splits)
+    total = max(1, sum(pairs for pairs, _ in counts.values()))
+    table = Table("split", "pairs", "share", "recordings", title=str(out), title_justify="left")
+    for name, (pairs, recordings) in counts.items():
+        table.add_row(name, f"{pairs:,}", f"{100 * pairs / total:.1f} %", f"{recordings:,}")
+    console().print(table)
+    if splits.divides_recordings:
+        print("a recording is divided between splits: for toy sets only")
+
+
+def view_pair(folder: Path, pair_id: str | None, picture: Path, kitti: Path | None) -> None:
+    """Draw a pair; with its source at hand, what the cars hide and where they may stand, too.
+
+    Raises:
+        InputError: no such pair, or the picture cannot be written.
+    """
+    from augkitti.dataset import open_dataset
+    from augkitti.draw import draw_pair
+
+    dataset = open_dataset(folder)
+    if not len(dataset):
+        raise InputError(folder, "holds no pair", "generate some")
+    pair = dataset[0 if pair_id is None else pair_id]
+    config = Config.model_validate(dataset.index.configuration)
+    profile = set_profile(folder, dataset.index)
+    prepared = None
+    root = source_of(dataset.index, profile, kitti)
+    if root is not None:
+        from augkitti.kitti import open_root
+        from pipelines.prepare import prepared_scan
+
+        sequence = open_root(root).sequence(pair.sequence)
+        prepared = [prepared_scan(sequence, f, profile, config, cache_folder())[0] for f in (pair.frame0, pair.frame1)]
+    if prepared is None:
+        print("no source at hand: give --kitti to see what the cars hide", file=sys.stderr)
+        draw_pair(pair, picture)
+    else:
+        scan0, scan1 = prepared
+        draw_pair(pair, picture, scan0.scan, scan1.scan, scan0.region, scan0.ground)
+    print(picture)
+
+
+def set_profile(folder: Path, index: DatasetIndex) -> ScannerProfile:
+    """The scanner profile that a data set's shards carry.
+
+    Raises:
+        InputError: the first shard is unreadable.
+    """
+    from augkitti.scanner import load_profile, profile_from_content
+    from augkitti.shards import read_metadata
+
+    if not index.shards:
+        return load_profile()
+    path = folder / index.shards[0].path
+    return profile_from_content(read_metadata(path).get("profile"), str(path))
+
+
+def source_of(index: DatasetIndex, profile: ScannerProfile, kitti: Path | None, make: bool = False) -> Path | None:
+    """Where the scans of a data set lie: `--kitti`, or for embedded streets the cache; None where that is not known.
+
+    Args:
+        index: of the data set.
+        profile: that its shards carry.
+        kitti: the root that was given.
+        make: draw embedded streets again where the cache has lost them.
+
+    Raises:
+        InputError: streets of another program version.
+    """
+    if index.source.get("kind") != "embedded":
+        return kitti
+    streets = streets_of(index.source, profile, cache_folder())
+    if make and not streets.are_there:
+        make_streets(streets, profile, jobs=1)
+    return streets.folder if streets.are_there else None
+
+
+def synthesize_drives(out: Path, drives: int, frames: int, seed: int, jobs: int, profile: Path | None) -> None:
+    """Write procedural streets in KITTI's layout.
+
+    Raises:
+        InputError: the folder is not empty or cannot be written, or the profile is bad.
+    """
+    from augkitti.scanner import load_profile
+    from augkitti.synthesize import synthesize
+
+    for folder in synthesize(out, drives, frames, seed, load_profile(profile), jobs):
+        print(folder)
+
+
+def show_info(folder: Path, as_json: bool, picture: Path | None, kitti: Path | None) -> None:
+    """Figures of a data set, beside the labelled motions of real KITTI.
+
+    Raises:
+        InputError: no data set there, or a shard, a source or the picture is at fault.
+    """
+    from augkitti.dataset_info import dataset_info, draw_info, info_json, info_tables
+
+    info = dataset_info(folder, None if kitti is None else labelled_motions(kitti))
+    if as_json:
+        print(info_json(info))
+    else:
+        for table in info_tables(info):
+            console().print(table)
+    if picture is not None:
+        draw_info(info, picture)
+        print(picture, file=sys.stderr if as_json else sys.stdout)
+
+
+def labelled_motions(kitti: Path, most: int = 500) -> Motions:
+    """Motions of the cars that KITTI labels under a root: of up to `most` pairs, in runs of neighbours per drive.
+
+    Raises:
+        InputError: the root holds no KITTI, or a source is unreadable.
+    """
+    from augkitti.dataset_info import info_of_pairs
+    from augkitti.kitti import label_reach, open_root
+    from pipelines.augment import make_pair
+    from pipelines.plan import Candidate
+    from pipelines.run import read_options
+
+    plain = read_options(
+        kitti=kitti, cad=None, out=Path(), n=1, seed=0, config=None, profile=None, stop_on_error=True, cars=(0, 0)
+    )
+    drives = [s for s in open_root(kitti).sequences if s.pairs and label_reach(s)[0] != "none"]
+    run = max(5, most // max(1, len(drives)))
+    made = (
+        make_pair(sequence, Candidate(f"{sequence.name}/{frame0}/0", frame0, 0, 0), plain)
+        for sequence in drives
+        for frame0, _ in sequence.pairs[:run]
+    )
+    return info_of_pairs(result[0] for result in made if result is not None).labelled

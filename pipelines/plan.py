@@ -7,9 +7,9 @@ Drawn once, before any scan is read, from names and numbers alone. How it works,
 2. Within a round, drives take turns in proportion to their length (systematic sampling: the k-th of a drive's F slots
    comes at (k + u) / F, u drawn per drive and round). A small `--n` has pairs of every drive, and the first n slots of
    a round are the same whatever `--n` is.
-3. A drive's pairs are dealt into *pools* of at most 32, every P-th pair of the drive, so that a pool reaches over the
-   whole drive. A pool in a round is a *shard*: one task and one file. Pools fill one after another to seven eighths,
-   then to the brim, so that spares are left in each until the round is nearly full.
+3. A drive's pairs are cut into *pools* of at most 32 neighbours. A pool in a round is a *shard*: one task and one
+   file. The drive's pools, in drawn order, fill to a quarter one after another, so that a small `--n` sees many places,
+   then to seven eighths, so that spares are left in each, and to the brim when the round is nearly full.
 4. A shard has an endless-enough *stream* of candidates that depends on seed, drive and pool alone, not on `--n`: its
    pool in drawn order at variant r, then, as spares, the pool again and again at variant numbers from 1,000,000 on,
    which no round reaches. The shard's pairs are the first `quota` candidates of the stream that can be made.
@@ -32,7 +32,6 @@ from augkitti.seeds import generator, pair_seed
 POOL_PAIRS = 32  # a shard of 32 pairs is about 130 MB: large enough to read fast, small enough to lose
 SPARE_PASSES = 4  # how often a pool is gone through again for spares
 SPARE_VARIANT = 1_000_000  # variants from here on are spares
-_RESERVE = 8  # one in eight of a pool is kept back while the round has other pairs
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ def plan_shards(pairs_of: Sequence[tuple[str, int]], n: int, seed: int, in_turn:
         taken = min(n - round_ * round_size, round_size)
         for (name, count), slots in zip(sequences, _slots(sequences, taken, seed, round_, in_turn), strict=True):
             pools = -(-count // POOL_PAIRS)
-            for pool, quota in enumerate(_quotas(count, pools, slots)):
+            for pool, quota in enumerate(_quotas(name, count, pools, slots, seed)):
                 if quota:
                     shards.append(ShardPlan(name, pool, pools, round_, quota))
     return tuple(sorted(shards, key=lambda shard: (shard.sequence, shard.number)))
@@ -109,7 +108,8 @@ def stream(shard: ShardPlan, frames: Sequence[int], seed: int) -> Iterator[Candi
         frames: first frames of all the sequence's source pairs, ascending.
         seed: of the data set.
     """
-    pool = list(frames[shard.pool :: shard.pools])
+    low, high = _bounds(len(frames), shard.pool, shard.pools)
+    pool = list(frames[low:high])
     for again in range(SPARE_PASSES + 1):
         variant = shard.round if again == 0 else SPARE_VARIANT + shard.round * SPARE_PASSES + again - 1
         order = generator(seed, "order", shard.sequence, shard.pool, variant).permutation(len(pool))
@@ -138,13 +138,20 @@ def _slots(sequences: Sequence[tuple[str, int]], taken: int, seed: int, round_: 
     return [int(count) for count in np.bincount(owner[:taken], minlength=len(counts))]
 
 
-def _quotas(count: int, pools: int, slots: int) -> list[int]:
+def _quotas(name: str, count: int, pools: int, slots: int, seed: int) -> list[int]:
     """How many of a sequence's slots fall to each of its pools."""
-    sizes = [len(range(pool, count, pools)) for pool in range(pools)]
+    order = [int(pool) for pool in generator(seed, "pools", name).permutation(pools)]
+    bounds = [_bounds(count, pool, pools) for pool in range(pools)]
+    sizes = [high - low for low, high in bounds]
     quotas = [0] * pools
-    for limit in ([size - size // _RESERVE for size in sizes], sizes):
-        for pool in range(pools):
-            more = min(limit[pool] - quotas[pool], slots)
+    for limits in ([-(-size // 4) for size in sizes], [size - size // 8 for size in sizes], sizes):
+        for pool in order:
+            more = min(max(limits[pool] - quotas[pool], 0), slots)
             quotas[pool] += more
             slots -= more
     return quotas
+
+
+def _bounds(count: int, pool: int, pools: int) -> tuple[int, int]:
+    """From where to where a pool's pairs stand among the sequence's."""
+    return pool * count // pools, (pool + 1) * count // pools

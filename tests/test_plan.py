@@ -63,7 +63,7 @@ def test_every_source_pair_is_used_once_before_any_is_used_twice(n, seed):
 def test_spares_carry_variants_that_no_round_reaches():
     shard = ShardPlan("b", 0, 3, round=2, quota=4)
     variants = [c.variant for c in stream(shard, range(70), seed=1)]
-    pool = len(range(0, 70, 3))
+    pool = 70 // 3
     assert set(variants[:pool]) == {2}
     assert min(variants[pool:]) >= SPARE_VARIANT
 
@@ -73,11 +73,16 @@ def test_a_small_set_draws_from_every_long_drive():
     assert sequences == {"x", "y", "z"}
 
 
-def test_a_pool_reaches_over_the_whole_drive():
-    shard = plan_shards((("long", 640),), 5, seed=0)[0]
-    frames = [c.frame0 for c, _ in zip(stream(shard, range(640), 0), range(32), strict=False)]
-    assert min(frames) < 64
-    assert max(frames) > 576
+def test_a_small_set_sees_many_places_of_a_long_drive():
+    shards = plan_shards((("long", 640),), 40, seed=0)
+    assert len(shards) >= 5
+    assert max(shard.pool for shard in shards) - min(shard.pool for shard in shards) > 10
+
+
+def test_the_pools_of_a_drive_hold_each_pair_once_and_do_not_overlap():
+    pools = [sorted({c.frame0 for c in stream(ShardPlan("x", p, 3, 0, 1), range(70), 5)}) for p in range(3)]
+    assert sorted(frame for pool in pools for frame in pool) == list(range(70))
+    assert pools[0][-1] < pools[1][0] <= pools[1][-1] < pools[2][0]
 
 
 def test_another_seed_gives_other_pairs():
