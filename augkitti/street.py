@@ -193,7 +193,7 @@ def _on_side_street(shape: Shape, s: F64, n: F64) -> tuple[Any, F64]:
     beyond = _beyond_kerb(shape, n)
     q = np.clip(beyond, 0.0, _CORNER_RADIUS_M)
     flare = _CORNER_RADIUS_M - np.sqrt(np.maximum(_CORNER_RADIUS_M**2 - (_CORNER_RADIUS_M - q) ** 2, 0.0))
-    off = np.full(np.broadcast_shapes(s.shape, n.shape), np.inf)
+    off: F64 = np.full(np.broadcast_shapes(s.shape, n.shape), np.inf)
     for crossing in shape.crossings:
         its = np.abs(s - crossing.s_m) - crossing.half_width_m - flare
         there = np.where(n > 0.0, crossing.left, crossing.right) & (beyond > 0.0)
@@ -230,7 +230,7 @@ def _net_lines(shape: Shape) -> tuple[F64, F64]:
 
 def _apart(values: F64) -> F64:
     ordered = np.unique(values)
-    return ordered[np.concatenate([[True], np.diff(ordered) > 1e-3])]
+    return np.asarray(ordered[np.concatenate([[True], np.diff(ordered) > 1e-3])])
 
 
 def _bend_to_corners(shape: Shape, s: F64, n: F64) -> F64:
@@ -357,9 +357,9 @@ def _pace(rng: np.random.Generator, duration_s: float, pace: int) -> tuple[float
 
 
 def _draw_shape(rng: np.random.Generator, travel_m: float, turns_off: bool) -> Shape:
-    lane = float(rng.uniform(2.9, 3.6))
-    parking = (bool(rng.random() < 0.6), bool(rng.random() < 0.7))
-    half = (lane + 2.1 * parking[0] + 0.2, lane + 2.1 * parking[1] + 0.2)
+    lane = float(rng.uniform(3.2, 4.2))
+    parking = (bool(rng.random() < 0.5), bool(rng.random() < 0.5))
+    half = (lane + 2.3 * parking[0] + 0.2, lane + 2.3 * parking[1] + 0.2)
     first = min(float(rng.uniform(18.0, 40.0)), 0.4 * travel_m + 25.0) if turns_off else float(rng.uniform(-25.0, 45.0))
     places = [first]
     while places[-1] + 60.0 < travel_m + _BEYOND_M:
@@ -370,9 +370,9 @@ def _draw_shape(rng: np.random.Generator, travel_m: float, turns_off: bool) -> S
         crossings.append(Crossing(at, float(rng.uniform(2.8, 3.8)), left, right or (turns_off and i == 0)))
     driveways = []
     for _ in range(2):
-        at = rng.uniform(-_BEYOND_M, travel_m + _BEYOND_M, int((travel_m + 2 * _BEYOND_M) / 30.0))
-        far = [min(abs(a - c.s_m) for c in crossings) > 15.0 for a in at]
-        driveways.append(tuple(float(a) for a in np.sort(at[far])))
+        ways = rng.uniform(-_BEYOND_M, travel_m + _BEYOND_M, int((travel_m + 2 * _BEYOND_M) / 30.0))
+        far = [min(abs(way - c.s_m) for c in crossings) > 15.0 for way in ways]
+        driveways.append(tuple(float(way) for way in np.sort(ways[far])))
     bumps = np.stack(
         [
             rng.uniform(0.01, 0.04, 6),
@@ -413,14 +413,14 @@ def _draw_shape(rng: np.random.Generator, travel_m: float, turns_off: bool) -> S
 
 
 def _ego_track(shape: Shape, rng: np.random.Generator, speed: float, acceleration: float, turns_off: bool) -> Track:
-    lane = -0.5 * shape.lane_m
+    lane = -0.47 * shape.lane_m
     begin, end = -20.0, float(shape.s_m[-1]) - 20.0
     corners = [(begin, lane), (end, lane)]
     if turns_off:
         crossing = shape.crossings[0]
         into = crossing.s_m - 0.5 * crossing.half_width_m
         corners = [(begin, lane), (into, lane), (into, -_ASIDE_M + 5.0)]
-    track = make_track(shape, corners, 8.0, _EGO_WHEELBASE_M, -begin, speed, acceleration)
+    track = make_track(shape, np.array(corners), 8.0, _EGO_WHEELBASE_M, -begin, speed, acceleration)
     return replace(track, sway_rad=0.001 if speed > 0.0 else 0.0, sway_phase=float(rng.uniform(0.0, 2.0 * np.pi)))
 
 
@@ -451,9 +451,15 @@ def _stand(
 
 def _standing_things(shape: Shape, rng: np.random.Generator) -> list[Mesh]:
     things: list[Mesh] = []
-    dense = bool(rng.random() < 0.5)  # a town street, or a suburb with gardens
+    kind = rng.random()
     for sign in (1.0, -1.0):
-        things += _house_row(shape, sign, dense, rng)
+        if kind < 0.3:  # a town street
+            setback = float(rng.uniform(0.1, 1.5))
+        elif kind < 0.75:  # a suburb with gardens
+            setback = float(rng.uniform(3.0, 9.0))
+        else:  # open land
+            setback = float(rng.uniform(9.0, 20.0))
+        things += _house_row(shape, sign, setback, rng)
         things += _kerbside(shape, sign, rng)
         things += _backdrop(shape, sign, rng)
     return things
@@ -473,22 +479,22 @@ def _clear_of_crossings(shape: Shape, sign: float, low: float, high: float, marg
     return True
 
 
-def _house_row(shape: Shape, sign: float, dense: bool, rng: np.random.Generator) -> list[Mesh]:
+def _house_row(shape: Shape, sign: float, setback: float, rng: np.random.Generator) -> list[Mesh]:
     half, pavement, driveways = _side(shape, sign)
     turn = 0.0 if sign > 0.0 else np.pi
     things: list[Mesh] = []
-    setback = float(rng.uniform(0.1, 1.5)) if dense else float(rng.uniform(3.0, 8.0))
+    dense = setback < 2.0
     s, end = float(shape.s_m[0]) + 8.0, float(shape.s_m[-1]) - 8.0
     while s < end:
         lot = float(rng.uniform(10.0, 22.0))
         if not _clear_of_crossings(shape, sign, s, s + lot, 3.5):
             s += 2.0
             continue
-        gap = float(rng.uniform(0.0, 1.0)) if dense and rng.random() < 0.6 else float(rng.uniform(2.5, 6.0))
+        gap = float(rng.uniform(0.0, 1.0)) if dense and rng.random() < 0.6 else float(rng.uniform(2.5, 7.0))
         front = half + pavement + setback + float(rng.uniform(0.0, 0.8))
         wide, deep = max(6.0, lot - gap), float(rng.uniform(8.0, 12.0))
         kind = rng.random()
-        if kind < 0.78:
+        if kind < (0.8 if dense else 0.66):
             floors = int(rng.integers(2, 5)) if dense else int(rng.integers(1, 4))
             mesh = objects.house(wide, deep, floors, rng)
             at = s if sign > 0.0 else s + wide
@@ -528,8 +534,8 @@ def _front_garden(
             start = at if sign > 0.0 else at + length
             things.append(_stand(shape, piece, start, sign * (half + pavement + 0.5), turn, (length, 0.0)))
         at += length
-    for _ in range(int(rng.integers(0, 4))):
-        plant = objects.tree(rng) if rng.random() < 0.35 else objects.bush(rng)
+    for _ in range(int(rng.integers(0, 5))):
+        plant = objects.tree(rng) if rng.random() < 0.45 else objects.bush(rng)
         place, q = s + float(rng.uniform(0.5, lot - 0.5)), float(rng.uniform(1.2, setback - 0.5))
         if all(abs(place - d) > 3.0 for d in driveways):
             things.append(_stand(shape, plant, place, sign * (half + pavement + q), 0.0))
@@ -540,7 +546,7 @@ def _kerbside(shape: Shape, sign: float, rng: np.random.Generator) -> list[Mesh]
     half, _, driveways = _side(shape, sign)
     things: list[Mesh] = []
     turn = np.pi if sign > 0.0 else 0.0
-    trees = rng.random() < 0.35
+    trees = rng.random() < 0.5
     for s in np.arange(float(shape.s_m[0]) + 10.0, float(shape.s_m[-1]) - 10.0, 14.0):
         at = float(s + rng.uniform(-4.0, 4.0))
         if not _clear_of_crossings(shape, sign, at, at, 1.0 + _CORNER_RADIUS_M):
@@ -548,11 +554,11 @@ def _kerbside(shape: Shape, sign: float, rng: np.random.Generator) -> list[Mesh]
         if any(abs(at - d) < 3.0 for d in driveways):
             continue
         kind = rng.random()
-        if kind < 0.3:
+        if kind < 0.25:
             thing = objects.lamp_post(rng)
-        elif kind < 0.5:
+        elif kind < 0.4:
             thing = objects.sign_post(rng)
-        elif kind < 0.7:
+        elif kind < 0.5:
             thing = objects.bin_or_bollard(rng)
         elif trees:
             thing = objects.tree(rng)
@@ -622,7 +628,7 @@ def _parked(shape: Shape, models: tuple[CarModel, ...], rng: np.random.Generator
     for sign in (1.0, -1.0):
         side = 0 if sign > 0.0 else 1
         half, _, driveways = _side(shape, sign)
-        full = float(rng.uniform(0.35, 0.85))
+        full = float(rng.uniform(0.25, 0.8))
         s = float(shape.s_m[0]) + 12.0
         while shape.parking[side] and s < float(shape.s_m[-1]) - 12.0:
             model = models[int(rng.integers(len(models)))]
@@ -631,7 +637,7 @@ def _parked(shape: Shape, models: tuple[CarModel, ...], rng: np.random.Generator
             free &= all(abs(s + 0.5 * length - d) > 0.5 * length + 2.0 for d in driveways)
             if free and rng.random() < full:
                 along = sign < 0.0 or rng.random() < 0.15
-                n = sign * (half - 0.5 * width - float(rng.uniform(0.1, 0.35)))
+                n = sign * (half - 0.5 * width - float(rng.uniform(0.08, 0.3)))
                 skew = float(rng.normal(0.0, 0.012)) * 3.0
                 first = (s + 0.5 * length + (1.0 if along else -1.0) * model.rear_axle_x_m, n)
                 ahead = (first[0] + (3.0 if along else -3.0), n + skew)

@@ -112,6 +112,7 @@ def hedge(length_m: float, rng: np.random.Generator) -> Mesh:
     height, thick = float(rng.uniform(0.8, 2.0)), float(rng.uniform(0.5, 1.0))
     count = int(60 * length_m * height)
     spots = rng.uniform([0.0, -0.5 * thick, 0.05], [length_m, 0.5 * thick, height], (count, 3))
+    spots[:, 2] *= 1.0 + 0.08 * np.sin(2.3 * spots[:, 0] + rng.uniform(0.0, 6.0)) + rng.normal(0.0, 0.04, count)
     face = rng.random(count)
     spots[face < 0.4, 1] = -0.5 * thick + rng.normal(0.0, 0.03, int((face < 0.4).sum()))
     spots[face > 0.7, 1] = 0.5 * thick + rng.normal(0.0, 0.03, int((face > 0.7).sum()))
