@@ -1,0 +1,285 @@
+"""Moving things without labels: a pair and its prepared scans in, the points of scan 0 against the ego-motion out.
+
+The test, for things that stand on the ground (figures and reasons in docs/decisions.md):
+
+1. Both scans are carried into one world frame by the ego-motion, each point at its own firing time, so that what stands
+   still coincides. Points that stand out of the ground form clusters in the ground plane.
+2. Free space: a point contradicts the other scan where all rays of that scan that pass it went on well beyond it. A
+   point that the other scan could not see (something nearer in the way, nothing returned) contradicts nothing.
+3. A cluster with such contradictions in it, or in scan 1 near it, is a suspect. It is moved about in the ground plane
+   to where it meets scan 1 best.
+4. It moves if it must be moved by a clear distance, if it then meets scan 1 clearly better than standing still (in both
+   directions: its points find points of scan 1, and those at its new place find it), and if the contradictions are a
+   good part of it. A wall, a hedge or the edge of something hidden fails one of these: part of it stands, or nothing
+   meets it anywhere.
+
+The ego car's own body, which goes with the scanner, counts as moving while the ego car does. Not found: things slower
+than `min_motion_m` a scan, things that scan 1 does not see, things that touch something large that stands.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from augkitti.config import MoversConfig
+from augkitti.frames import F64, Array, se3_exp, se3_log, transform_points
+from augkitti.ground import height_at
+from augkitti.scan_pair import Bool, PreparedScan, ScanPair
+
+I64 = npt.NDArray[np.int64]
+
+_COLUMNS = 2048  # of a range image: 0.176 degrees, the step of a firing
+_TOP_M = 4.0  # above the ground: higher things are leaves, signs and houses
+_TRUNCATE_M = 0.5  # a point without a partner counts as this far off
+_MAP_M = 0.15  # cell of the map on which a cluster is moved about
+_SAMPLE = 150  # points of a cluster that are moved about
+_CLEAR_M = 0.3  # round a cluster: points of scan 1 this near its new place are to be explained by it
+_EGO_BODY_M = (-3.2, 2.2, 1.5)  # rear, front, side of the ego car round its scanner: mirrors are seen there
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A cluster of scan 0 that contradicts the ego-motion, and how well motion explains it."""
+
+    points: I64  # (P,) of scan 0
+    visible: int  # how many of them scan 1 could see
+    against: int  # contradictions: its points that scan 1 sees past, and those of scan 1 at its new place likewise
+    met: int  # points of scan 1 at its new place
+    motion_m: F64  # (2,) in the ground plane that makes it meet scan 1 best
+    misfit_still_m: float  # mean distance to the other scan, standing still, truncated
+    misfit_moved_m: float  # the same, moved
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One scan in the world frame (velo0 at the middle of scan 0, held still), and its range image to look up."""
+
+    rows: I64  # (S,) points that stand out of the ground, in reach
+    points: F64  # (S, 3) world, by rising x
+    image: F64  # (rings, columns) nearest range, inf where nothing returned
+    elevation_rad: F64  # (rings,) falling
+    height_m: F64  # (rings,) of the beams' start
+    T_scanner_world: F64  # (columns, 4, 4) when the scanner looks along each column
+
+    def within(self, low: F64, high: F64) -> I64:
+        """Indices of points in a box along the axes; points are sorted by x."""
+        first, last = np.searchsorted(self.points[:, 0], [low[0], high[0]])
+        part = self.points[first:last, 1:]
+        return np.asarray(np.flatnonzero(((part > low[1:]) & (part < high[1:])).all(axis=1)) + first)
+
+
+def find_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig) -> Bool:
+    """Which points (N0,) of scan 0 move against the static world.
+
+    Args:
+        pair: two neighbouring scans; its `ego_motion` is what standing things follow.
+        prepared0: rays and ground of scan 0; the drivable region is not used.
+        prepared1: the same of scan 1.
+        config: bounds.
+    """
+    moving = np.zeros(len(pair.scan0), dtype=bool)
+    found = [s.points for s in find_suspects(pair, prepared0, prepared1, config) if moves(s, config)]
+    if found:
+        moving[_with_feet(np.concatenate(found), prepared0, config)] = True
+    if float(np.hypot(pair.ego_motion[0, 3], pair.ego_motion[1, 3])) >= config.min_motion_m:
+        moving[_ego_body(prepared0)] = True
+    return moving
+
+
+def moves(suspect: Suspect, config: MoversConfig) -> bool:
+    """Step 4 of the test."""
+    return bool(
+        suspect.visible + suspect.met >= config.min_points
+        and np.hypot(suspect.motion_m[0], suspect.motion_m[1]) >= config.min_motion_m
+        and suspect.misfit_moved_m <= config.max_misfit_m
+        and suspect.misfit_moved_m <= config.max_misfit_ratio * suspect.misfit_still_m
+        and suspect.against >= max(3.0, config.min_against * (suspect.visible + suspect.met))
+    )
+
+
+def find_suspects(
+    pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig
+) -> Iterator[Suspect]:
+    """Steps 1 to 3 of the test."""
+    interval_s = max(pair.scan1.time_s - pair.scan0.time_s, 1e-3)
+    per_second = se3_log(pair.ego_motion) / interval_s  # T_velo(t)_world = exp(t per_second)
+    view0 = _view(prepared0, per_second, 0.0, config)
+    view1 = _view(prepared1, per_second, interval_s, config)
+    if len(view0.rows) == 0 or len(view1.rows) == 0:
+        return
+    past0, hidden0 = _look(view1, view0.points)
+    past1, hidden1 = _look(view0, view1.points)
+    tree0, tree1 = cKDTree(view0.points), cKDTree(view1.points)
+    against1 = cKDTree(view1.points[past1][:, :2]) if past1.any() else None
+    for members in _clusters(view0.points, config):
+        mine = view0.points[members]
+        low, high = mine.min(axis=0), mine.max(axis=0)
+        length = float(np.hypot(high[0] - low[0], high[1] - low[1]))
+        seen = members[~hidden0[members]]
+        if len(members) < config.min_points or length > config.max_length_m or len(seen) < 3:
+            continue
+        against = int(past0[seen].sum())
+        reach = 0.5 * length + config.max_motion_m
+        nearby = 0
+        if against1 is not None:
+            nearby = int(against1.query_ball_point(0.5 * (low + high)[:2], reach, return_length=True))
+        if against + nearby < max(3.0, config.min_against * len(seen)):
+            continue
+        seen = seen[:: max(1, len(seen) // _SAMPLE)]
+        scale = (len(members) - int(hidden0[members].sum())) / len(seen)
+
+        def misfit(move: F64, seen: I64 = seen, low: F64 = low, high: F64 = high) -> tuple[float, I64]:
+            """Mean truncated distance both ways, and the points of scan 1 at the cluster's new place."""
+            step = np.array([move[0], move[1], 0.0])
+            there = view1.within(low + step - _CLEAR_M, high + step + _CLEAR_M)
+            there = there[~hidden1[there]]
+            forth = _distance(tree1, view0.points[seen] + step)
+            back = _distance(tree0, view1.points[there[:: max(1, len(there) // _SAMPLE)]] - step)
+            return float(forth.sum() + back.sum()) / (len(forth) + len(back)), there
+
+        still, _ = misfit(np.zeros(2))
+        if still < config.min_misfit_m:
+            continue
+        margin = config.max_motion_m + _TRUNCATE_M
+        others = view1.points[view1.within(low - margin, high + margin)]
+        motion = _best_motion(view0.points[seen], others, config)
+        moved, there = misfit(motion)
+        visible = round(scale * len(seen))
+        against += int(past1[there].sum())
+        yield Suspect(view0.rows[members], visible, against, len(there), motion, still, moved)
+
+
+def _distance(tree: cKDTree, points: F64) -> F64:
+    return np.asarray(np.minimum(tree.query(points, distance_upper_bound=_TRUNCATE_M)[0], _TRUNCATE_M))
+
+
+def _view(prepared: PreparedScan, per_second: F64, start_s: float, config: MoversConfig) -> _View:
+    scan, rays = prepared.scan, prepared.rays
+    xyz = scan.xyz.astype(np.float64)
+    across = np.hypot(xyz[:, 0], xyz[:, 1])
+    rows = np.flatnonzero(~prepared.ground.is_ground & (across < config.reach_m))
+    height = xyz[rows, 2] - height_at(prepared.ground, xyz[rows, :2])
+    rows = rows[(height > config.min_height_m) & (height < _TOP_M)]
+    times, which = np.unique(rays.ray_time_s[rays.ray[rows]], return_inverse=True)
+    points = transform_points(se3_exp(per_second, -(start_s + times))[which], xyz[rows])
+    order = np.argsort(points[:, 0], kind="stable")
+    rows, points = rows[order], points[order]
+
+    rings = int(rays.ray_ring.max()) + 1
+    elevation = _mean_by(rays.ray_ring, rays.ray_elevation_rad, rings)
+    height_m = _mean_by(rays.ring, xyz[:, 2] - np.tan(elevation)[rays.ring] * across, rings)
+    image = np.full(rings * _COLUMNS, np.inf)
+    pixel = rays.ring.astype(np.int64) * _COLUMNS + _column(np.arctan2(xyz[:, 1], xyz[:, 0]))
+    np.minimum.at(image, pixel, np.sqrt((xyz * xyz).sum(axis=1)))
+    azimuth = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * 2.0 * np.pi - np.pi
+    # The scanner turns clockwise and looks straight ahead at the scan's middle (scanner.md section 1).
+    looks = -azimuth / (2.0 * np.pi) * scan.period_s if scan.kind == "raw" else np.zeros(_COLUMNS)
+    T_scanner_world = se3_exp(per_second, start_s + looks)
+    return _View(rows, points, image.reshape(rings, _COLUMNS), elevation, height_m, T_scanner_world)
+
+
+def _mean_by(group: Array, values: F64, groups: int) -> F64:
+    return np.bincount(group, values, groups) / np.maximum(np.bincount(group, minlength=groups), 1)
+
+
+def _column(azimuth_rad: F64) -> I64:
+    return np.minimum(((azimuth_rad + np.pi) / (2.0 * np.pi) * _COLUMNS).astype(np.int64), _COLUMNS - 1)
+
+
+def _look(view: _View, points_world: F64) -> tuple[Bool, Bool]:
+    """Which world points (S,) a scan saw past, and which are hidden from it or out of its view."""
+    T = view.T_scanner_world
+    at = transform_points(T[_COLUMNS // 2], points_world)
+    for _ in range(2):  # when the scanner looks there depends on where the point is then
+        at = transform_points(T[_column(np.arctan2(at[:, 1], at[:, 0]))], points_world)
+    across = np.hypot(at[:, 0], at[:, 1])
+    distance = np.sqrt((at * at).sum(axis=1))
+    column = _column(np.arctan2(at[:, 1], at[:, 0]))
+    rings = len(view.elevation_rad)
+    between = -0.5 * (view.elevation_rad[1:] + view.elevation_rad[:-1])  # rising
+    ring = np.full(len(at), rings // 2)
+    for _ in range(2):  # beams start at two heights
+        elevation = np.arctan2(at[:, 2] - view.height_m[ring], across)
+        ring = np.searchsorted(between, -elevation)
+    outside = (elevation > view.elevation_rad[0] + 0.004) | (elevation < view.elevation_rad[-1] - 0.004)
+
+    margin = 0.2 + 0.003 * distance  # noise, bias between beams, and 0.2 degrees of ego rotation on slanted surfaces
+    nearest = np.full(len(at), np.inf)
+    agree = np.zeros(len(at), dtype=bool)
+    returns = np.zeros(len(at), dtype=np.int64)
+    for up in (-1, 0, 1):
+        for aside in (-1, 0, 1):
+            found = view.image[np.clip(ring + up, 0, rings - 1), (column + aside) % _COLUMNS]
+            nearest = np.minimum(nearest, found)
+            agree |= np.abs(found - distance) <= margin
+            returns += np.isfinite(found)
+    past = (nearest > distance + margin) & (returns >= 4) & ~outside
+    hidden = (~agree & (nearest < distance - margin)) | (returns < 2) | outside
+    return past, hidden
+
+
+def _clusters(points: F64, config: MoversConfig) -> Iterator[I64]:
+    """Members of each cluster of world points: cells of the ground plane that touch."""
+    label = _cluster_of(points, config)
+    order = np.argsort(label, kind="stable")
+    yield from np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+
+
+def _cluster_of(points: F64, config: MoversConfig) -> I64:
+    corner = points[:, :2].min(axis=0)
+    cell = ((points[:, :2] - corner) / config.cell_m).astype(np.int64)
+    taken = np.zeros(cell.max(axis=0) + 1, dtype=bool)
+    taken[cell[:, 0], cell[:, 1]] = True
+    label, _ = ndimage.label(taken, np.ones((3, 3)))
+    return np.asarray(label[cell[:, 0], cell[:, 1]], dtype=np.int64)
+
+
+def _best_motion(points: F64, others: F64, config: MoversConfig) -> F64:
+    """Translation (2,) in the ground plane that brings points nearest to others; the shortest of equals."""
+    reach = config.max_motion_m
+    low = points[:, :2].min(axis=0) - reach - 2.0 * _TRUNCATE_M
+    shape = ((points[:, :2].max(axis=0) + reach + 2.0 * _TRUNCATE_M - low) / _MAP_M).astype(np.int64) + 1
+    cell = np.floor((others[:, :2] - low) / _MAP_M).astype(np.int64)
+    cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
+    steps = np.arange(-int(reach / _MAP_M), int(reach / _MAP_M) + 1)
+    if len(cell) == 0:
+        return np.zeros(2)
+    free = np.ones(shape, dtype=bool)
+    free[cell[:, 0], cell[:, 1]] = False
+    away = np.minimum(ndimage.distance_transform_edt(free) * _MAP_M, _TRUNCATE_M)
+    sample = points[:: max(1, len(points) // _SAMPLE), :2]
+    start = np.floor((sample - low) / _MAP_M).astype(np.int64) + steps[0]
+    windows = np.lib.stride_tricks.sliding_window_view(away, (len(steps), len(steps)))
+    cost = windows[start[:, 0], start[:, 1]].mean(axis=0)
+    cost += 0.01 * _MAP_M * np.hypot(steps[:, None], steps[None, :])
+    i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
+    return np.array([steps[i], steps[j]]) * _MAP_M
+
+
+def _with_feet(found: I64, prepared: PreparedScan, config: MoversConfig) -> I64:
+    """Add what is low and stands in the same cells of the ground plane: wheels and sills under a car's body."""
+    xy = prepared.scan.xyz[:, :2].astype(np.float64)
+    corner = xy[found].min(axis=0) - config.cell_m
+    shape = ((xy[found].max(axis=0) + config.cell_m - corner) / config.cell_m).astype(np.int64) + 1
+    cell = np.floor((xy - corner) / config.cell_m).astype(np.int64)
+    taken = np.zeros(shape, dtype=bool)
+    taken[cell[found, 0], cell[found, 1]] = True
+    taken = ndimage.binary_dilation(taken, np.ones((3, 3)))
+    near = np.flatnonzero(((cell >= 0) & (cell < shape)).all(axis=1) & ~prepared.ground.is_ground)
+    near = near[taken[cell[near, 0], cell[near, 1]]]
+    height = prepared.scan.xyz[near, 2] - height_at(prepared.ground, xy[near])
+    low = near[(height > 0.1) & (height <= config.min_height_m)]
+    return np.concatenate([found, low])
+
+
+def _ego_body(prepared: PreparedScan) -> I64:
+    """Points of the ego car itself: it goes with the scanner, not with the world."""
+    rear, front, side = _EGO_BODY_M
+    xyz = prepared.scan.xyz
+    near = np.flatnonzero((xyz[:, 0] > rear) & (xyz[:, 0] < front) & (np.abs(xyz[:, 1]) < side))
+    height = xyz[near, 2] - height_at(prepared.ground, xyz[near, :2])
+    return np.asarray(near[height > 0.3])
