@@ -25,7 +25,7 @@ def finish_set(run: Run, rows: Sequence[ShardRow]) -> None:
     """Write the index and the card of a run whose shards are all done.
 
     Raises:
-        InputError: not one pair was made, or the disk refuses.
+        InputError: the disk refuses.
     """
     options = run.options
     entries = [row.entry for row in rows if row.entry is not None]

@@ -15,7 +15,7 @@ from pipelines.augment import augment_all
 from pipelines.finish import finish_set
 from pipelines.plan import ShardPlan
 from pipelines.prepare import prepare_all
-from pipelines.run import Options, Run, check_output, open_run, reopen_run, start_work
+from pipelines.run import Options, Run, check_output, is_finished, open_run, reopen_run, start_work
 from pipelines.shard_row import ShardRow, read_row
 from pipelines.stage import console
 from pipelines.streets import Streets, make_streets
@@ -41,24 +41,41 @@ def generate(options: Options, jobs: int, resume: bool, dry_run: bool) -> int:
     if dry_run:
         return show_plan(options, jobs)
     started = time.monotonic()
-    run = prepare_stage(options, jobs, resume)
+    run = _begin(options, jobs, resume)
+    if resume and is_finished(run):
+        print(f"{options.out} is finished and whole: nothing to do")
+        return 0
+    _prepare(run, jobs, resume)
     rows = augment_all(run, jobs)
     return _close(run, rows, time.monotonic() - started)
 
 
-def prepare_stage(options: Options, jobs: int, resume: bool) -> Run:
+def prepare_stage(options: Options, jobs: int, resume: bool) -> None:
     """Check the input, make the streets if need be, begin the work folder, and fill the cache.
 
     Raises:
         InputError: as `generate`.
     """
+    run = _begin(options, jobs, resume)
+    _prepare(run, jobs, resume)
+
+
+def _begin(options: Options, jobs: int, resume: bool) -> Run:
+    """All checks, the first line, and the streets if need be."""
     assert options.models is not None  # bad car models are told before anything is made
     check_output(options.out, resume)
+    if options.streets is None:
+        run = open_run(options)
+        print(_first_line(options), flush=True)
+        return run
     print(_first_line(options), flush=True)
-    if options.streets is not None:
-        make_streets(options.streets, options.scanner, jobs)
-    run = open_run(options)
+    make_streets(options.streets, options.scanner, jobs)
+    return open_run(options)
+
+
+def _prepare(run: Run, jobs: int, resume: bool) -> None:
     start_work(run, resume)
+    options = run.options
     made, kept = prepare_all(
         run.sequences,
         run.planned_frames(),
@@ -69,7 +86,6 @@ def prepare_stage(options: Options, jobs: int, resume: bool) -> Run:
         options.stop_on_error,
     )
     print(f"prepared: {made} made, {kept} found in {options.cache}", file=sys.stderr)
-    return run
 
 
 def augment_stage(out: Path, jobs: int) -> None:

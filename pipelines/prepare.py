@@ -154,17 +154,18 @@ def _cache_path(cache_folder: Path, parts: list[Any]) -> Path:
 
 
 def _load(path: Path) -> dict[str, Any] | None:
-    """The arrays of a cache file; None where there is none, or none that can be read."""
+    """The arrays of a cache file; None where there is none, or none that can be read and bears its own name."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+            content = {name: arrays[name] for name in arrays.files}
+        return content if str(content["key"]) == path.stem else None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
         return None
 
 
 def _store(path: Path, arrays: dict[str, Any]) -> None:
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    np.savez_compressed(buffer, allow_pickle=False, key=np.array(path.stem), **arrays)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_whole(path, lambda file: file.write(buffer.getvalue()))

@@ -16,11 +16,20 @@ from typing import Any
 
 import augkitti
 from augkitti.config import Config, load_config
-from augkitti.dataset_index import write_text
+from augkitti.dataset_index import (
+    CARD_NAME,
+    DATA_NAME,
+    INDEX_NAME,
+    SPLITS_NAME,
+    file_sha256,
+    read_index,
+    write_text,
+)
 from augkitti.errors import InputError
 from augkitti.kitti import KittiRoot, Sequence, known_ego_motion, label_reach, open_root, read_labels
 from augkitti.scan_pair import CarModel
 from augkitti.scanner import ScannerProfile, load_profile
+from augkitti.shards import read_metadata, shard_metadata
 from pipelines.plan import ShardPlan, first_choice, plan_shards
 from pipelines.streets import Streets, find_streets
 
@@ -200,23 +209,58 @@ def skip_entry(err: InputError, root: Path, count: int) -> dict[str, Any]:
 
 
 def check_output(out: Path, resume: bool) -> None:
-    """Refuse an output folder that holds something, unless it is to be resumed, or that cannot be written.
+    """Refuse an output folder that holds something, unless it is a run to be resumed, or that cannot be written.
 
     Raises:
         InputError: as said.
     """
     try:
         if out.is_dir():
-            if any(out.iterdir()) and not resume:
-                problem = "holds an unfinished run" if (out / WORK).is_dir() else "is not empty"
+            held = sorted(path.name for path in out.iterdir())
+            foreign = [name for name in held if name not in (WORK, DATA_NAME, INDEX_NAME, SPLITS_NAME, CARD_NAME)]
+            if held and not resume:
+                problem = "holds an unfinished run" if WORK in held else "is not empty"
                 raise InputError(out, problem, "take another --out, or --resume to go on with it")
+            if held and (foreign or (WORK not in held and INDEX_NAME not in held)):
+                raise InputError(out / (foreign or held)[0], "is no part of a run", "take another --out")
         elif out.exists():
             raise InputError(out, "is not a folder", "take another --out")
-        nearest = next(folder for folder in (out, *out.absolute().parents) if folder.is_dir())
+        nearest = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
         with tempfile.TemporaryFile(dir=nearest):
             pass
     except OSError as err:
         raise InputError(out, f"cannot be written ({err.strerror})", "take another --out, or mend permissions") from err
+
+
+def is_finished(run: Run) -> bool:
+    """Whether the output folder holds the run's data set, finished and whole; takes a broken one's index away.
+
+    Raises:
+        InputError: it holds a finished data set made otherwise; names what differs.
+    """
+    out, options = run.options.out, run.options
+    if options.work.is_dir() or not (out / INDEX_NAME).is_file():
+        return False
+    index = read_index(out)
+    wanted = shard_metadata(options.config, options.scanner, options.models)
+    readable = [shard for shard in index.shards if (out / shard.path).is_file()]
+    found = read_metadata(out / readable[0].path) if readable else wanted
+    differs = [key for key in ("version", "config", "profile_digest", "models") if found.get(key) != wanted[key]]
+    if index.seed != options.seed:
+        differs.append("seed")
+    names = {f"{DATA_NAME}/{shard.name}.parquet" for shard in run.shards}
+    if not {shard.path for shard in index.shards} <= names or index.rows > options.n:
+        differs.append("source or --n")
+    if differs:
+        raise InputError(out, f"was made with another {', '.join(differs)}", "resume with the same, or start anew")
+    short = options.n - index.rows
+    if short == 0 and all(
+        shard in readable and file_sha256(out / shard.path) == shard.sha256 for shard in index.shards
+    ):
+        return True
+    for name in (INDEX_NAME, SPLITS_NAME, CARD_NAME):
+        (out / name).unlink(missing_ok=True)
+    return False
 
 
 def start_work(run: Run, resume: bool) -> None:
@@ -248,7 +292,7 @@ def start_work(run: Run, resume: bool) -> None:
     content = {"options": settings, "identity": run.identity, "plan": [shard.as_json() for shard in run.shards]}
     try:
         (work / "rows").mkdir(parents=True, exist_ok=True)
-        (options.out / "data").mkdir(exist_ok=True)
+        (options.out / DATA_NAME).mkdir(exist_ok=True)
         write_text(state, json.dumps(content, indent=1))
     except OSError as err:
         raise InputError(work, f"cannot be written ({err.strerror})", "take another --out") from err

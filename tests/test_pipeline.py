@@ -1,0 +1,267 @@
+"""Generation as a whole, on tiny drives: same bytes whatever the order, interruptions and processes; nothing lost."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_drive import write_drive, write_odometry
+
+import pipelines.augment
+from augkitti.config import Config
+from augkitti.dataset import open_dataset
+from augkitti.dataset_index import read_index
+from augkitti.errors import InputError
+from augkitti.kitti import open_root, read_scan
+from augkitti.scanner import assign_rays, load_profile
+from pipelines.generate import augment_stage, finish_stage, generate, prepare_stage
+from pipelines.prepare import prepared_scan
+from pipelines.run import WORK, read_options
+
+FOUND = {"data", "dataset.json", "README.md"}
+
+
+@pytest.fixture(scope="session")
+def drives(tmp_path_factory):
+    """Two raw drives, three and two pairs, and an odometry pair."""
+    root = tmp_path_factory.mktemp("kitti")
+    write_drive(root, frames=(40, 41, 42, 43), name="2011_09_26_drive_0005_sync", truth=True)
+    write_drive(root, frames=(0, 1, 2), name="2011_09_26_drive_0101_sync", labels="none", oxts=False)
+    write_odometry(root / "odometry")
+    return root
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def options_of(root, out, cache, n=4, **changes):
+    values = {"cad": None, "seed": 0, "config": None, "profile": None, "stop_on_error": False, **changes}
+    return replace(read_options(kitti=root, out=out, n=n, **values), cache=cache)
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="session")
+def made(drives, cache, tmp_path_factory):
+    """A data set of eight pairs, made in this process."""
+    out = tmp_path_factory.mktemp("made") / "aug"
+    assert generate(options_of(drives, out, cache, n=8), jobs=1, resume=False, dry_run=False) == 0
+    return out
+
+
+def test_a_finished_folder_holds_the_data_set_and_nothing_else(made):
+    assert {path.name for path in made.iterdir()} == FOUND
+    index = read_index(made)
+    assert index.rows == 8
+    assert {path.name for path in (made / "data").iterdir()} == {Path(s.path).name for s in index.shards}
+    text = (made / "dataset.json").read_text() + (made / "README.md").read_text()
+    assert str(made.parent) not in text
+
+
+def test_pairs_are_named_by_sequence_frame_and_variant_and_none_stands_twice(made):
+    ids = open_dataset(made).pair_ids
+    assert len(set(ids)) == 8
+    frames = sorted(name.rsplit("/", 1)[0] for name in ids)
+    assert len(set(frames)) == 6, "each source pair once before any is used twice"
+
+
+def test_two_processes_give_the_same_bytes_as_one(made, drives, cache, tmp_path):
+    assert generate(options_of(drives, tmp_path / "aug", cache, n=8), jobs=2, resume=False, dry_run=False) == 0
+    assert digests(tmp_path / "aug") == digests(made)
+
+
+def test_a_run_that_was_cut_off_goes_on_to_the_same_bytes(made, drives, cache, tmp_path, monkeypatch):
+    out = tmp_path / "aug"
+    options = options_of(drives, out, cache, n=8)
+    whole, calls = pipelines.augment.make_pair, []
+
+    def cut_off(*arguments):
+        calls.append(arguments)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return whole(*arguments)
+
+    monkeypatch.setattr(pipelines.augment, "make_pair", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        generate(options, jobs=1, resume=False, dry_run=False)
+    assert not (out / "dataset.json").exists()
+    finished = list((out / WORK / "rows").iterdir())
+    assert finished
+    (out / "data" / "left-over.parquet").write_bytes(b"of a dead run")
+    monkeypatch.undo()
+    assert generate(options, jobs=1, resume=True, dry_run=False) == 0
+    assert digests(out) == digests(made)
+
+
+def test_shards_that_went_missing_are_made_again_with_the_same_bytes(made, drives, cache, tmp_path):
+    out = tmp_path / "aug"
+    prepare_stage(options_of(drives, out, cache, n=8), jobs=1, resume=False)
+    augment_stage(out, jobs=1)
+    first, second, *_ = sorted((out / "data").iterdir())
+    first.unlink()
+    second.write_bytes(second.read_bytes()[:-100])
+    with pytest.raises(InputError, match="unfinished"):
+        finish_stage(out)
+    augment_stage(out, jobs=1)
+    assert finish_stage(out) == 0
+    assert digests(out) == digests(made)
+
+
+def test_a_finished_set_that_lost_a_shard_is_mended_by_resume(made, drives, cache, tmp_path):
+    out = tmp_path / "aug"
+    shutil.copytree(made, out)
+    next((out / "data").iterdir()).unlink()
+    assert generate(options_of(drives, out, cache, n=8), jobs=1, resume=True, dry_run=False) == 0
+    assert digests(out) == digests(made)
+
+
+def test_resuming_with_other_settings_is_refused_and_named(drives, cache, tmp_path):
+    prepare_stage(options_of(drives, tmp_path / "aug", cache, n=2, min_points=30), jobs=1, resume=False)
+    with pytest.raises(InputError, match="another configuration"):
+        prepare_stage(options_of(drives, tmp_path / "aug", cache, n=2), jobs=1, resume=True)
+    with pytest.raises(InputError, match="another seed"):
+        prepare_stage(options_of(drives, tmp_path / "aug", cache, n=2, seed=1, min_points=30), jobs=1, resume=True)
+
+
+def test_a_larger_set_holds_the_pairs_of_a_smaller_one_unchanged(made, drives, cache, tmp_path):
+    assert generate(options_of(drives, tmp_path / "aug", cache, n=3), jobs=1, resume=False, dry_run=False) == 0
+    small, large = open_dataset(tmp_path / "aug"), open_dataset(made)
+    assert set(small.pair_ids) <= set(large.pair_ids)
+    for name in small.pair_ids:
+        a, b = small[name], large[name]
+        assert a.seed == b.seed
+        np.testing.assert_array_equal(a.scan0.xyz, b.scan0.xyz)
+        np.testing.assert_array_equal(a.flow0, b.flow0)
+
+
+def test_plain_pairs_carry_the_real_labels_and_every_measured_point(drives, cache, tmp_path):
+    options = options_of(drives, tmp_path / "k", cache, n=6, cars=(0, 0))
+    assert generate(options, jobs=1, resume=False, dry_run=False) == 0
+    root = open_root(drives)
+    for pair in open_dataset(tmp_path / "k"):
+        assert all(item.origin == "labelled" for item in pair.objects)
+        np.testing.assert_array_equal(pair.scan0.xyz, read_scan(root.sequence(pair.sequence), pair.frame0).xyz)
+        assert len(pair.scan0.removed) == 0
+
+
+def test_an_unreadable_scan_is_left_out_listed_and_filled_from_spares(drives, cache, tmp_path):
+    root = tmp_path / "kitti"
+    shutil.copytree(drives, root)
+    scan = root / "raw/2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data/0000000043.bin"
+    scan.write_bytes(scan.read_bytes()[:-5])
+    out = tmp_path / "aug"
+    assert generate(options_of(root, out, cache, n=6), jobs=1, resume=False, dry_run=False) == 0
+    index = read_index(out)
+    assert index.rows == 6
+    listed = [row for row in index.skipped if "0000000043.bin" in row["source"]]
+    assert listed
+    assert "cut short" in listed[0]["reason"]
+    assert str(tmp_path) not in json.dumps(index.skipped)
+    assert not any(name.startswith("2011_09_26_drive_0005_sync/42/") for name in open_dataset(out).pair_ids)
+
+
+def test_a_drive_whose_labels_are_broken_leaves_its_pairs_to_the_others(drives, cache, tmp_path):
+    root = tmp_path / "kitti"
+    shutil.copytree(drives, root)
+    (root / "raw/2011_09_26/2011_09_26_drive_0005_sync/tracklet_labels.xml").write_text("<tracklets>")
+    assert generate(options_of(root, tmp_path / "aug", cache, n=3), jobs=1, resume=False, dry_run=False) == 0
+    index = read_index(tmp_path / "aug")
+    assert index.rows == 3
+    assert {shard.sequence for shard in index.shards} <= {"2011_09_26_drive_0101_sync", "odometry_04"}
+    assert [row["count"] for row in index.skipped if "tracklet_labels.xml" in row["source"]] == [3]
+
+
+def test_a_shortfall_is_told_by_the_exit_code(drives, cache, tmp_path, capsys):
+    options = options_of(drives, tmp_path / "aug", cache, n=1, min_points=100_000)
+    assert generate(options, jobs=1, resume=False, dry_run=False) == 1
+    assert "no virtual car found room" in capsys.readouterr().out
+    root = tmp_path / "kitti"
+    shutil.copytree(drives / "odometry", root / "odometry")
+    shutil.copytree(drives / "raw", root / "raw")
+    for frame in (41, 42, 43):
+        (root / f"raw/2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data/{frame:010d}.bin").write_bytes(b"")
+    assert generate(options_of(root, tmp_path / "short", cache, n=6), jobs=1, resume=False, dry_run=False) == 1
+    assert "short by 3 of 6" in capsys.readouterr().err
+    assert read_index(tmp_path / "short").rows == 3
+
+
+def test_rows_with_nan_or_zeros_are_dropped_and_counted(drives, cache, tmp_path):
+    root = tmp_path / "kitti"
+    shutil.copytree(drives / "odometry", root / "odometry")
+    path = root / "odometry/sequences/04/velodyne/000000.bin"
+    rows = np.fromfile(path, dtype=np.float32).reshape(-1, 4)
+    rows[100:107] = np.nan
+    rows[200:205] = 0.0
+    rows.tofile(path)
+    options = options_of(root, tmp_path / "aug", cache, n=1, cars=(0, 0))
+    assert generate(options, jobs=1, resume=False, dry_run=False) == 0
+    assert read_index(tmp_path / "aug").totals["invalid_rows"] == 12
+    pair = open_dataset(tmp_path / "aug")[0]
+    assert not np.isin(pair.scan0.source, [*range(100, 107), *range(200, 205)]).any()
+
+
+# --- the cache ------------------------------------------------------------------------------------------------------
+
+
+def assert_same(a, b, where=""):
+    for item in fields(a):
+        x, y = getattr(a, item.name), getattr(b, item.name)
+        if hasattr(x, "__dataclass_fields__"):
+            assert_same(x, y, f"{where}{item.name}.")
+        elif isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype, f"{where}{item.name}"
+            np.testing.assert_array_equal(x, y, err_msg=f"{where}{item.name}")
+        else:
+            assert x == y, f"{where}{item.name}"
+
+
+@pytest.mark.parametrize(("name", "frame"), [("2011_09_26_drive_0101_sync", 1), ("odometry_04", 0)])
+def test_a_prepared_scan_comes_back_from_the_cache_bit_for_bit(drives, tmp_path, name, frame):
+    sequence, profile, config = open_root(drives).sequence(name), load_profile(), Config()
+    fresh, was_made = prepared_scan(sequence, frame, profile, config, tmp_path)
+    again, made_again = prepared_scan(sequence, frame, profile, config, tmp_path)
+    assert (was_made, made_again) == (True, False)
+    assert_same(fresh, again)
+
+
+def test_a_damaged_or_foreign_cache_file_is_noticed_and_made_again(drives, tmp_path):
+    sequence, profile, config = open_root(drives).sequence("2011_09_26_drive_0101_sync"), load_profile(), Config()
+    fresh, _ = prepared_scan(sequence, 0, profile, config, tmp_path)
+    (file,) = (path for path in tmp_path.rglob("*.npz"))
+    good = file.read_bytes()
+    prepared_scan(sequence, 1, profile, config, tmp_path)
+    (other,) = (path for path in tmp_path.rglob("*.npz") if path != file)
+    for bad in (b"", good[: len(good) // 2], good[:500] + b"\x00" * 40 + good[540:], other.read_bytes()):
+        file.write_bytes(bad)
+        again, was_made = prepared_scan(sequence, 0, profile, config, tmp_path)
+        assert was_made
+        assert_same(fresh, again)
+        assert file.read_bytes() == good
+
+
+def test_another_ground_setting_is_not_answered_from_the_cache(drives, tmp_path):
+    sequence, profile = open_root(drives).sequence("2011_09_26_drive_0101_sync"), load_profile()
+    config = Config()
+    other = config.model_copy(update={"ground": config.ground.model_copy(update={"cell_m": 1.0})})
+    assert prepared_scan(sequence, 0, profile, config, tmp_path)[1]
+    assert prepared_scan(sequence, 0, profile, other, tmp_path)[1]
+    assert not prepared_scan(sequence, 0, profile, config.model_copy(update={"min_points": 99}), tmp_path)[1]
+
+
+@pytest.mark.kitti
+def test_prepared_real_scans_with_stray_points_come_back_bit_for_bit(kitti_root, tmp_path):
+    sequence = open_root(kitti_root).sequence("2011_09_26_drive_0009_sync")
+    profile = load_profile()
+    frames = [f for f in sequence.frames if (assign_rays(read_scan(sequence, f), profile).tick == 65535).any()][:1]
+    fresh, _ = prepared_scan(sequence, (frames or [sequence.frames[0]])[0], profile, Config(), tmp_path)
+    again, was_made = prepared_scan(sequence, (frames or [sequence.frames[0]])[0], profile, Config(), tmp_path)
+    assert not was_made
+    assert_same(fresh, again)
