@@ -1,11 +1,10 @@
 """Augmented KITTI: virtual cars with exact motion labels in real LiDAR scans; numpy arrays in and out."""
 
-import sys
-from types import ModuleType
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from augkitti.augment_pair import augment_pair
+    from augkitti.augmentation import augment_pair
     from augkitti.dataset import Dataset
     from augkitti.dataset import open_dataset as open
 
@@ -14,7 +13,7 @@ __all__ = ["Dataset", "augment_pair", "open"]
 
 _PLACES = {  # loaded on first use, so that `import augkitti` and `augkitti --help` stay light
     "Dataset": "augkitti.dataset:Dataset",
-    "augment_pair": "augkitti.augment_pair:augment_pair",
+    "augment_pair": "augkitti.augmentation:augment_pair",
     "open": "augkitti.dataset:open_dataset",
 }
 
@@ -22,30 +21,9 @@ _PLACES = {  # loaded on first use, so that `import augkitti` and `augkitti --he
 def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'augkitti' has no attribute {name!r}")
-    return _load(name)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
-
-
-def _load(name: str) -> Any:
-    from importlib import import_module
-
     module, attribute = _PLACES[name].split(":")
     return getattr(import_module(module), attribute)
 
 
-class _Package(ModuleType):
-    """Keeps `augkitti.augment_pair` the function: importing the module of that name would put the module there."""
-
-    @property
-    def augment_pair(self) -> Any:
-        return _load("augment_pair")
-
-    @augment_pair.setter
-    def augment_pair(self, module: ModuleType) -> None:
-        pass
-
-
-sys.modules[__name__].__class__ = _Package
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

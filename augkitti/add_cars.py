@@ -1,0 +1,201 @@
+"""Virtual cars of a pair and its prepared scans in; their returns in both scans, and the finished pair, out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from augkitti.config import Config
+from augkitti.frames import F32, F64, compose, invert
+from augkitti.labelled_objects import LabelledObjects, pair_interval
+from augkitti.movers import find_movers
+from augkitti.occlusion import Occluded, keep_nearest
+from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
+from augkitti.placement import car_box
+from augkitti.raycast import CarHits, cast_car, rays_near
+from augkitti.scan_pair import (
+    I16,
+    MEASURED,
+    NO_TICK,
+    AugmentedPair,
+    AugmentedScan,
+    Bool,
+    ObjectRecord,
+    PreparedScan,
+    ScanPair,
+    VirtualCar,
+)
+from augkitti.scanner import ScannerProfile
+from augkitti.scene_flow import scene_flow
+from augkitti.sensor_noise import CarLook, CarReturns, simulate_returns
+
+_NEAR_M = 0.3  # rays are tried this far round the car's box, beside what it moves within the sweep
+
+
+@dataclass(frozen=True, eq=False)
+class Cast:
+    """One car as both scans meet it."""
+
+    hits: tuple[CarHits, CarHits]
+    returns: tuple[CarReturns, CarReturns]
+
+
+def cast_and_measure(
+    car: VirtualCar,
+    pair: ScanPair,
+    scan0: PreparedScan,
+    scan1: PreparedScan,
+    profile: ScannerProfile,
+    config: Config,
+    rng: np.random.Generator,
+) -> Cast:
+    """Cast a car into both scans, each ray at its own firing time, and send the pulses."""
+    opaque = config.glass == "opaque"
+    look = CarLook(paint=car.paint, tint=float(rng.random()))
+    twist = ego_twist(pair.ego_motion, pair_interval(pair))
+    hits, returns = [], []
+    for prepared, pose, moment, start in (
+        (scan0, car.pose0, car.moment0_s, 0.0),
+        (scan1, car.pose1, car.moment1_s, pair_interval(pair)),
+    ):
+        rays = prepared.rays
+        rolling = prepared.scan.kind == "raw" and config.shutter == "rolling"
+        near = rays_near(
+            rays, pose, car.model.size_m, _NEAR_M + (_sweep_drift(car, twist, prepared) if rolling else 0.0)
+        )
+        times = rays.ray_time_s[near] if rolling else np.full(len(near), moment)
+        moments, which = np.unique(times, return_inverse=True)
+        T_car_scanner = compose(invert(T_world_car(car, start + moments)), T_world_scanner(twist, start + moments))
+        its_hits = cast_car(car.model, T_car_scanner[which], rays, near, profile, opaque)
+        hits.append(its_hits)
+        returns.append(simulate_returns(its_hits, look, rays, profile, opaque, rng))
+    return Cast((hits[0], hits[1]), (returns[0], returns[1]))
+
+
+def _sweep_drift(car: VirtualCar, twist: F64, prepared: PreparedScan) -> float:
+    """How far the car and the scanner move against each other while the sweep passes the car, at most (metres)."""
+    speed = abs(car.speed_mps) + float(np.sqrt((twist[:3] ** 2).sum()))
+    return speed * prepared.scan.period_s / 4.0
+
+
+def seen_well_enough(
+    casts: Sequence[Cast], scan0: PreparedScan, scan1: PreparedScan, profile: ScannerProfile, min_points: int
+) -> bool:
+    """Whether every car keeps at least `min_points` returns in both scans once all hide each other."""
+    for k, prepared in enumerate((scan0, scan1)):
+        simulated = occlude(casts, k, prepared, profile).simulated
+        if (np.bincount(simulated.car, minlength=len(casts)) < min_points).any():
+            return False
+    return True
+
+
+def occlude(casts: Sequence[Cast], k: int, prepared: PreparedScan, profile: ScannerProfile) -> Occluded:
+    """Scan k with all cars in it."""
+    return keep_nearest(prepared, [(cast.hits[k].ray, cast.returns[k]) for cast in casts], profile)
+
+
+def finish_pair(
+    pair: ScanPair,
+    scan0: PreparedScan,
+    scan1: PreparedScan,
+    labelled: LabelledObjects,
+    cars: Sequence[VirtualCar],
+    casts: Sequence[Cast],
+    profile: ScannerProfile,
+    config: Config,
+    seed: int,
+    pair_id: str,
+) -> AugmentedPair:
+    """Hide what the cars hide, label every point, and fill the contract's columns."""
+    occluded0, occluded1 = occlude(casts, 0, scan0, profile), occlude(casts, 1, scan1, profile)
+    first_car = len(labelled.objects)
+    columns0 = _columns(scan0, occluded0, labelled.instance0, first_car)
+    columns1 = _columns(scan1, occluded1, labelled.instance1, first_car)
+    objects = [
+        *labelled.objects,
+        *(_virtual_object(i, *item, scan0, scan1) for i, item in enumerate(zip(cars, casts, strict=True))),
+    ]
+    counts0 = np.bincount(columns0.instance[columns0.instance >= 0], minlength=len(objects))
+    counts1 = np.bincount(columns1.instance[columns1.instance >= 0], minlength=len(objects))
+    counted = tuple(
+        replace(item, points0=int(counts0[row]), points1=int(counts1[row])) for row, item in enumerate(objects)
+    )
+    open_flow = labelled.unknown0 | (unlabelled_movers(pair, labelled, scan0, scan1, config) & (labelled.instance0 < 0))
+    unknown0 = np.concatenate([open_flow[occluded0.kept], np.zeros(len(occluded0.simulated.xyz), dtype=bool)])
+    flow0, status0 = scene_flow(columns0, pair.ego_motion, counted, unknown0)
+    return AugmentedPair(
+        pair_id=pair_id,
+        sequence=pair.sequence,
+        recording=pair.recording,
+        frame0=pair.frame0,
+        frame1=pair.frame1,
+        time0=pair.scan0.time_s,
+        time1=pair.scan1.time_s,
+        scan_kind=pair.scan0.kind,
+        seed=seed,
+        ego_motion=pair.ego_motion,
+        ego_source=pair.ego_source,
+        label_coverage=pair.label_coverage,
+        label_azimuth=pair.label_azimuth,
+        scan0=columns0,
+        scan1=columns1,
+        flow0=flow0,
+        flow_status0=status0,
+        objects=counted,
+    )
+
+
+def unlabelled_movers(
+    pair: ScanPair, labelled: LabelledObjects, scan0: PreparedScan, scan1: PreparedScan, config: Config
+) -> Bool:
+    """Points (N0,) of scan 0 that contradict the ego-motion where the source's labels do not reach."""
+    if pair.label_coverage == "full":
+        return np.zeros(len(pair.scan0), dtype=bool)
+    movers = find_movers(pair, scan0, scan1, config.movers)
+    if pair.label_coverage == "camera" and pair.label_azimuth is not None:
+        azimuth = np.arctan2(pair.scan0.xyz[:, 1], pair.scan0.xyz[:, 0])
+        movers &= (azimuth < pair.label_azimuth[0]) | (azimuth > pair.label_azimuth[1])
+    return movers
+
+
+def _columns(prepared: PreparedScan, occluded: Occluded, instance: I16, first_car: int) -> AugmentedScan:
+    scan, rays, kept, new = prepared.scan, prepared.rays, occluded.kept, occluded.simulated
+    return AugmentedScan(
+        xyz=_joined(scan.xyz[kept], new.xyz),
+        reflectance=np.concatenate([scan.reflectance[kept], new.reflectance]),
+        ring=np.concatenate([rays.ring[kept], new.ring]),
+        tick=np.concatenate([rays.tick[kept], new.tick]),
+        source=np.concatenate([scan.row[kept], np.full(len(new.xyz), -1, dtype=np.int32)]),
+        instance=np.concatenate([instance[kept], (new.car + first_car).astype(np.int16)]),
+        surface=np.concatenate([np.full(int(kept.sum()), MEASURED, dtype=np.uint8), new.surface]),
+        removed=scan.row[~kept],
+    )
+
+
+def _joined(measured: F32, simulated: F32) -> F32:
+    return np.ascontiguousarray(np.concatenate([measured, simulated]), dtype=np.float32)
+
+
+def _virtual_object(index: int, car: VirtualCar, cast: Cast, scan0: PreparedScan, scan1: PreparedScan) -> ObjectRecord:
+    on_lattice = [
+        int((p.rays.ray_tick[h.ray] != NO_TICK).sum()) if p.scan.kind == "raw" else len(h.ray)
+        for p, h in zip((scan0, scan1), cast.hits, strict=True)
+    ]
+    return ObjectRecord(
+        id=f"virtual_{index}",
+        category=car.model.category,
+        origin="virtual",
+        model=car.model.name,
+        box0=car_box(car.model, car.pose0),
+        box1=car_box(car.model, car.pose1),
+        pose0=car.pose0,
+        pose1=car.pose1,
+        moment0=car.moment0_s,
+        moment1=car.moment1_s,
+        motion=compose(car.pose1, invert(car.pose0)),
+        rays0=on_lattice[0],
+        rays1=on_lattice[1],
+        speed=car.speed_mps,
+        yaw_rate=car.yaw_rate_rps,
+        steering=car.steering_rad,
+    )

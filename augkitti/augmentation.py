@@ -1,0 +1,68 @@
+"""The story: a real scan pair and car models in, the same pair with virtual cars and exact labels out.
+
+Read `augment_pair` first; each step is a file of its own.
+"""
+
+from collections.abc import Sequence
+
+from augkitti.add_cars import Cast, cast_and_measure, finish_pair, seen_well_enough
+from augkitti.config import Config
+from augkitti.drivable import find_drivable_region
+from augkitti.ground import fit_ground
+from augkitti.labelled_objects import label_points
+from augkitti.placement import make_scene, propose_car
+from augkitti.scan_pair import AugmentedPair, CarModel, PreparedScan, Scan, ScanPair, VirtualCar
+from augkitti.scanner import ScannerProfile, assign_rays
+from augkitti.seeds import generator
+
+
+def prepare_scan(scan: Scan, profile: ScannerProfile, config: Config) -> PreparedScan:
+    """All that depends on one scan alone: its rays, the ground, and where a car may stand."""
+    rays = assign_rays(scan, profile)
+    ground = fit_ground(scan.xyz, config.ground)
+    region = find_drivable_region(scan, rays, ground, config.drivable)
+    return PreparedScan(scan, rays, ground, region)
+
+
+def augment_pair(
+    pair: ScanPair,
+    models: Sequence[CarModel],
+    profile: ScannerProfile,
+    config: Config,
+    seed: int,
+    pair_id: str,
+    prepared: tuple[PreparedScan, PreparedScan] | None = None,
+) -> AugmentedPair | None:
+    """Put virtual cars into a pair (PointFlowNet section 4.1); None where fewer than `config.cars` found room.
+
+    Args:
+        pair: two neighbouring scans with ego-motion and labels.
+        models: the cars to draw from.
+        profile: the scanner that took the scans.
+        config: how many cars, where, how they move and how they are cast.
+        seed: of this pair alone; the same seed gives the same bytes.
+        pair_id: the contract's name of the pair.
+        prepared: both scans as `prepare_scan` gives them, if at hand.
+    """
+    scan0, scan1 = prepared or (prepare_scan(pair.scan0, profile, config), prepare_scan(pair.scan1, profile, config))
+    labelled = label_points(pair, scan0, scan1)
+    scene = make_scene(pair, scan0, scan1, config)
+    fewest, most = config.cars
+    rng = generator(seed, "place")
+    wanted = int(rng.integers(fewest, most + 1))
+
+    cars: list[VirtualCar] = []
+    casts: list[Cast] = []
+    for attempt in range(config.placement.attempts):
+        if len(cars) == wanted:
+            break
+        car = propose_car(scene, cars, models, must_move=not cars, config=config, rng=rng)  # place and motion
+        if car is None:
+            continue
+        cast = cast_and_measure(car, pair, scan0, scan1, profile, config, generator(seed, "look", attempt))
+        if seen_well_enough([*casts, cast], scan0, scan1, profile, config.min_points):
+            cars.append(car)
+            casts.append(cast)
+    if len(cars) < fewest:
+        return None
+    return finish_pair(pair, scan0, scan1, labelled, cars, casts, profile, config, seed, pair_id)
