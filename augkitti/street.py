@@ -365,7 +365,7 @@ def _draw_shape(rng: np.random.Generator, travel_m: float, turns_off: bool) -> S
     while places[-1] + 60.0 < travel_m + _BEYOND_M:
         places.append(places[-1] + float(rng.uniform(55.0, 120.0)))
     crossings = []
-    for i, at in enumerate(places):
+    for i, at in enumerate(place for place in places if place < travel_m + _BEYOND_M - 15.0):
         left, right = ((True, True), (True, False), (False, True))[int(rng.integers(3))]
         crossings.append(Crossing(at, float(rng.uniform(2.8, 3.8)), left, right or (turns_off and i == 0)))
     driveways = []

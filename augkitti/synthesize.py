@@ -52,7 +52,7 @@ ROAD, SIDEWALK, LAND = 1, 2, 3
 _PERIOD_S = 0.1034
 _SEE_M = 85.0
 _LABEL_M = 75.0  # KITTI's annotators went about this far
-_START = datetime(2000, 1, 1, 12, tzinfo=UTC)
+_START = datetime(2000, 1, 1, 12, 0, 1, tzinfo=UTC)
 _T_VELO_IMU = np.array([[1.0, 0, 0, -0.81], [0, 1.0, 0, 0.32], [0, 0, 1.0, -0.8], [0, 0, 0, 1.0]])
 _FRINGE_TICKS, _FRINGE_RETURN = 40, 0.5  # real scans: beams 44 to 63 lose 3 to 13 % of all rays beside the shadow
 _FOCAL, _CENTRE, _IMAGE = 720.0, (610.0, 172.0), (1242, 375)
