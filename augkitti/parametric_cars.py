@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from augkitti.cad_models import finished_model
+from augkitti.cad_vehicle import finished_model
 from augkitti.frames import F64
 from augkitti.scan_pair import GLASS, LAMP, OTHER, PAINT, TYRE, CarModel
 
