@@ -22,7 +22,7 @@ from augkitti.scanner import azimuth_time
 ABOVE_GROUND_M = 0.15  # contract: lower points in a box are ground
 SHELL_M = 0.2  # contract: round a moving labelled box the flow is not known
 SEAM_RAD = np.deg2rad(15.0)  # contract: straight behind, the sweep sees things twice or not at all
-_STANDING_M = 0.05  # displacement over ground below which a box stands: labels are no better
+_STANDING_M = 0.1  # displacement over ground below which a box stands: boxes of parked cars wander by 6 cm a scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ def label_points(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedSca
     """Match the boxes of both scans by id, give each its motion, and find its points."""
     by_id1 = {label.id: label for label in pair.labels1}
     ids0 = {label.id for label in pair.labels0}
-    rows = [(label, by_id1.get(label.id)) for label in pair.labels0]
+    rows: list[tuple[LabelledBox | None, LabelledBox | None]] = [(a, by_id1.get(a.id)) for a in pair.labels0]
     rows += [(None, label) for label in pair.labels1 if label.id not in ids0]
     objects = tuple(_object(pair, first, second) for first, second in rows)
     boxes0 = [o.box0 for o in objects]

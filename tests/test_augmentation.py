@@ -1,0 +1,128 @@
+"""The method end to end on one pair: cars go in, labels come out, and nothing else changes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_drive import write_drive
+
+import augkitti
+from augkitti import kitti
+from augkitti.augmentation import prepare_scan
+from augkitti.config import Config
+from augkitti.frames import compose, invert, transform_points
+from augkitti.parametric_cars import parametric_cars
+from augkitti.scan_pair import AugmentedPair, PreparedScan, ScanPair
+from augkitti.scanner import load_profile
+
+PROFILE = load_profile()
+MODELS = tuple(model for model in parametric_cars() if model.category == "Car")
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> tuple[ScanPair, tuple[PreparedScan, PreparedScan]]:
+    drive = write_drive(tmp_path_factory.mktemp("drive"), frames=(0, 1))
+    (sequence,) = kitti.open_root(drive.root).sequences
+    pair = kitti.read_pair(sequence, 0)
+    return pair, (prepare_scan(pair.scan0, PROFILE, Config()), prepare_scan(pair.scan1, PROFILE, Config()))
+
+
+def augmented(source, seed: int = 5, **settings) -> AugmentedPair:
+    pair, prepared = source
+    result = augkitti.augment_pair(pair, MODELS, PROFILE, Config(**settings), seed, "tiny/0/0", prepared)
+    assert result is not None
+    return result
+
+
+def virtual(pair: AugmentedPair):
+    return [(row, item) for row, item in enumerate(pair.objects) if item.origin == "virtual"]
+
+
+def test_one_to_three_cars_are_seen_in_both_scans_and_one_moves(source) -> None:
+    for seed in range(4):
+        cars = virtual(augmented(source, seed))
+        assert 1 <= len(cars) <= 3
+        assert any(abs(item.speed) >= 1.0 for _, item in cars)
+        for _, item in cars:
+            assert min(item.points0, item.points1) >= 20
+            assert item.rays0 >= item.points0
+
+
+def test_measured_points_are_untouched_and_all_accounted_for(source) -> None:
+    pair, _ = source
+    result = augmented(source)
+    for scan, after in ((pair.scan0, result.scan0), (pair.scan1, result.scan1)):
+        kept = after.source >= 0
+        np.testing.assert_array_equal(after.xyz[kept], scan.xyz[np.searchsorted(scan.row, after.source[kept])])
+        np.testing.assert_array_equal(np.sort(np.concatenate([after.source[kept], after.removed])), scan.row)
+        assert (np.diff(after.source[kept]) > 0).all()
+        new_order = after.ring[~kept].astype(int) * 4000 + after.tick[~kept]
+        assert (np.diff(new_order) > 0).all()
+
+
+def test_simulated_points_carry_the_motion_that_takes_them_to_their_second_box(source) -> None:
+    result = augmented(source)
+    for row, item in virtual(result):
+        mine = result.scan0.instance == row
+        assert (result.flow_status0[mine] == 0).all()
+        landed = result.scan0.xyz[mine] + result.flow0[mine]
+        np.testing.assert_allclose(landed, transform_points(item.motion, result.scan0.xyz[mine]), atol=2e-5)
+        local = np.abs(transform_points(invert(item.pose1), landed))
+        assert (local <= item.box1[3:6] / 2 + 0.25).all()
+        np.testing.assert_allclose(item.motion, compose(item.pose1, invert(item.pose0)), atol=1e-12)
+
+
+def test_car_drives_at_its_speed_over_the_ground(source) -> None:
+    result = augmented(source)
+    interval = result.time1 - result.time0
+    for _, item in virtual(result):
+        standing = transform_points(result.ego_motion, item.box0[:3])
+        moved = float(np.linalg.norm(item.box1[:3] - standing)) / (interval + item.moment1 - item.moment0)
+        assert moved == pytest.approx(abs(item.speed), abs=1.3)  # moments: the scanner itself moves meanwhile
+
+
+def test_same_seed_gives_the_same_pair_and_another_seed_another(source) -> None:
+    first, again, other = augmented(source), augmented(source), augmented(source, 6)
+    np.testing.assert_array_equal(first.scan0.xyz, again.scan0.xyz)
+    np.testing.assert_array_equal(first.scan1.reflectance, again.scan1.reflectance)
+    np.testing.assert_array_equal(first.flow0, again.flow0)
+    assert len(first.scan0) != len(other.scan0)
+
+
+def test_opaque_glass_shows_nothing_inside(source) -> None:
+    through = [np.count_nonzero(augmented(source, seed).scan0.surface == 6) for seed in range(4)]
+    closed = [np.count_nonzero(augmented(source, seed, glass="opaque").scan0.surface == 6) for seed in range(4)]
+    assert sum(through) > 0
+    assert closed == [0, 0, 0, 0]
+
+
+def test_no_cars_asked_for_gives_the_plain_pair_with_its_real_labels(source) -> None:
+    result = augmented(source, cars=(0, 0))
+    assert virtual(result) == []
+    assert len(result.objects) == 2
+    assert len(result.scan0.removed) == 0
+    assert (result.scan0.source >= 0).all()
+
+
+def test_snapshot_shutter_has_all_cars_at_the_middle_of_the_scan(source) -> None:
+    for _, item in virtual(augmented(source, shutter="snapshot")):
+        assert item.moment0 == 0.0
+        assert item.moment1 == 0.0
+
+
+def test_pair_without_room_gives_nothing(source) -> None:
+    pair, prepared = source
+    blocked = tuple(replace(p, region=replace(p.region, drivable=np.zeros_like(p.region.drivable))) for p in prepared)
+    assert augkitti.augment_pair(pair, MODELS, PROFILE, Config(), 5, "tiny/0/0", blocked) is None
+
+
+@pytest.mark.kitti
+def test_compensated_scans_are_cast_as_a_snapshot_without_ticks(kitti_root: Path) -> None:
+    sequences = [s for s in kitti.open_root(kitti_root).sequences if s.kind == "compensated" and s.pairs]
+    pair = kitti.read_pair(sequences[0], sequences[0].pairs[0][0])
+    result = augkitti.augment_pair(pair, MODELS, PROFILE, Config(), 1, "x/0/0")
+    assert result is not None
+    assert (result.scan0.tick == 65535).all()
+    assert all(item.moment0 == 0.0 for _, item in virtual(result))
+    assert np.count_nonzero(result.scan0.surface) >= 20
