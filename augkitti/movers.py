@@ -35,20 +35,23 @@ I64 = npt.NDArray[np.int64]
 _COLUMNS = 2048  # of a range image: 0.176 degrees, the step of a firing
 _TOP_M = 4.0  # above the ground: higher things are leaves, signs and houses
 _TRUNCATE_M = 0.5  # a point without a partner counts as this far off
-_MAP_M = 0.15  # cell of the map on which a cluster is moved about
-_SAMPLE = 150  # points of a cluster that are moved about
+_MAP_M = 0.1  # cell of the map on which a cluster is moved about
+_COARSE_SAMPLE = 60  # points of a cluster that are moved about on it
+_SAMPLE = 150  # points of a cluster that are compared with the other scan
 _CLEAR_M = 0.3  # round a cluster: points of scan 1 this near its new place are to be explained by it
 _EGO_BODY_M = (-3.2, 2.2, 1.5)  # rear, front, side of the ego car round its scanner: mirrors are seen there
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """A cluster of scan 0 that contradicts the ego-motion, and how well motion explains it."""
+    """A cluster of scan 0 that contradicts the ego-motion, and how well a motion explains it."""
 
     points: I64  # (P,) of scan 0
-    visible: int  # how many of them scan 1 could see
-    against: int  # contradictions: its points that scan 1 sees past, and those of scan 1 at its new place likewise
+    length_m: float  # diagonal in the ground plane
     met: int  # points of scan 1 at its new place
+    visible: int  # of its points and of those, how many the other scan could see if it stood
+    against: int  # how many of these contradict standing
+    explained: float  # share of the contradictions that the motion explains
     motion_m: F64  # (2,) in the ground plane that makes it meet scan 1 best
     misfit_still_m: float  # mean distance to the other scan, standing still, truncated
     misfit_moved_m: float  # the same, moved
@@ -92,12 +95,17 @@ def find_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan
 
 def moves(suspect: Suspect, config: MoversConfig) -> bool:
     """Step 4 of the test."""
+    step = float(np.hypot(suspect.motion_m[0], suspect.motion_m[1]))
+    # What stands aside of its own way contradicts at its two ends only.
+    share = max(config.min_against, 0.3 * min(step / max(suspect.length_m, 0.5), 0.5))
     return bool(
-        suspect.visible + suspect.met >= config.min_points
-        and np.hypot(suspect.motion_m[0], suspect.motion_m[1]) >= config.min_motion_m
+        step >= config.min_motion_m
+        and suspect.met >= 3
+        and len(suspect.points) + suspect.met >= 2 * config.min_points
         and suspect.misfit_moved_m <= config.max_misfit_m
         and suspect.misfit_moved_m <= config.max_misfit_ratio * suspect.misfit_still_m
-        and suspect.against >= max(3.0, config.min_against * (suspect.visible + suspect.met))
+        and suspect.against >= max(4.0, share * suspect.visible)
+        and suspect.explained >= config.min_explained
     )
 
 
@@ -114,43 +122,63 @@ def find_suspects(
     past0, hidden0 = _look(view1, view0.points)
     past1, hidden1 = _look(view0, view1.points)
     tree0, tree1 = cKDTree(view0.points), cKDTree(view1.points)
-    against1 = cKDTree(view1.points[past1][:, :2]) if past1.any() else None
+    new1 = np.flatnonzero(past1)
+    tree_new1 = cKDTree(view1.points[new1, :2]) if len(new1) else None
     for members in _clusters(view0.points, config):
         mine = view0.points[members]
         low, high = mine.min(axis=0), mine.max(axis=0)
         length = float(np.hypot(high[0] - low[0], high[1] - low[1]))
-        seen = members[~hidden0[members]]
-        if len(members) < config.min_points or length > config.max_length_m or len(seen) < 3:
+        if len(members) < config.min_points or length > config.max_length_m:
             continue
-        against = int(past0[seen].sum())
-        reach = 0.5 * length + config.max_motion_m
-        nearby = 0
-        if against1 is not None:
-            nearby = int(against1.query_ball_point(0.5 * (low + high)[:2], reach, return_length=True))
-        if against + nearby < max(3.0, config.min_against * len(seen)):
+        near = np.zeros(0, dtype=np.int64)
+        if tree_new1 is not None:
+            reach = 0.5 * length + config.max_motion_m
+            near = new1[np.array(sorted(tree_new1.query_ball_point(0.5 * (low + high)[:2], reach)), dtype=np.int64)]
+        if int(past0[members].sum()) + len(near) < max(4.0, config.min_against * len(members)):
             continue
-        seen = seen[:: max(1, len(seen) // _SAMPLE)]
-        scale = (len(members) - int(hidden0[members].sum())) / len(seen)
-
-        def misfit(move: F64, seen: I64 = seen, low: F64 = low, high: F64 = high) -> tuple[float, I64]:
-            """Mean truncated distance both ways, and the points of scan 1 at the cluster's new place."""
-            step = np.array([move[0], move[1], 0.0])
-            there = view1.within(low + step - _CLEAR_M, high + step + _CLEAR_M)
-            there = there[~hidden1[there]]
-            forth = _distance(tree1, view0.points[seen] + step)
-            back = _distance(tree0, view1.points[there[:: max(1, len(there) // _SAMPLE)]] - step)
-            return float(forth.sum() + back.sum()) / (len(forth) + len(back)), there
-
-        still, _ = misfit(np.zeros(2))
-        if still < config.min_misfit_m:
-            continue
+        some = members[:: -(-len(members) // _SAMPLE)]
+        if not hidden0[some].all():
+            still = _distance(tree1, view0.points[some[~hidden0[some]]])
+            if (still < 0.15).mean() > 0.97 and hidden0[some].mean() < 0.5:
+                continue  # all of it is met where it stands
         margin = config.max_motion_m + _TRUNCATE_M
         others = view1.points[view1.within(low - margin, high + margin)]
-        motion = _best_motion(view0.points[seen], others, config)
-        moved, there = misfit(motion)
-        visible = round(scale * len(seen))
-        against += int(past1[there].sum())
-        yield Suspect(view0.rows[members], visible, against, len(there), motion, still, moved)
+        motion = _best_motion(view0.points[some], others, view1.points[near], config)
+        step = np.array([motion[0], motion[1], 0.0])
+        there = view1.within(low + step - _CLEAR_M, high + step + _CLEAR_M)
+        wide = near[((view1.points[near] > low + step - 1.0) & (view1.points[near] < high + step + 1.0)).all(axis=1)]
+        there = np.union1d(there, wide)
+        if len(there) == 0:
+            continue
+        back = there[:: -(-len(there) // _SAMPLE)]
+        mine, theirs = view0.points[some], view1.points[back]
+        still = _misfit(tree1, mine, hidden0[some], tree0, theirs, hidden1[back])
+        moved = _misfit(
+            tree1, mine + step, _look(view1, mine + step)[1], tree0, theirs - step, _look(view0, theirs - step)[1]
+        )
+        gone, come = members[past0[members]], there[past1[there]]
+        gone_some, come_some = gone[:: -(-len(gone) // _SAMPLE) or 1], come[:: -(-len(come) // _SAMPLE) or 1]
+        left = _distance(tree1, view0.points[gone_some] + step) < config.max_misfit_m * 1.5
+        came = _distance(tree0, view1.points[come_some] - step) < config.max_misfit_m * 1.5
+        explained = (left.mean() if len(left) else 0.0) * len(gone) + (came.mean() if len(came) else 0.0) * len(come)
+        against = len(gone) + len(come)
+        yield Suspect(
+            points=view0.rows[members],
+            length_m=length,
+            met=len(there),
+            visible=int((~hidden0[members]).sum() + (~hidden1[there]).sum()),
+            against=against,
+            explained=float(explained) / max(1, against),
+            motion_m=motion,
+            misfit_still_m=still,
+            misfit_moved_m=moved,
+        )
+
+
+def _misfit(tree1: cKDTree, points0: F64, hidden0: Bool, tree0: cKDTree, points1: F64, hidden1: Bool) -> float:
+    """Mean truncated distance (metres) both ways, over what the other scan can see."""
+    both = np.concatenate([_distance(tree1, points0[~hidden0]), _distance(tree0, points1[~hidden1])])
+    return float(both.mean()) if len(both) else _TRUNCATE_M
 
 
 def _distance(tree: cKDTree, points: F64) -> F64:
@@ -238,26 +266,38 @@ def _cluster_of(points: F64, config: MoversConfig) -> I64:
     return np.asarray(label[cell[:, 0], cell[:, 1]], dtype=np.int64)
 
 
-def _best_motion(points: F64, others: F64, config: MoversConfig) -> F64:
-    """Translation (2,) in the ground plane that brings points nearest to others; the shortest of equals."""
-    reach = config.max_motion_m
-    low = points[:, :2].min(axis=0) - reach - 2.0 * _TRUNCATE_M
-    shape = ((points[:, :2].max(axis=0) + reach + 2.0 * _TRUNCATE_M - low) / _MAP_M).astype(np.int64) + 1
+def _best_motion(points: F64, others: F64, new: F64, config: MoversConfig) -> F64:
+    """Translation (2,) in the ground plane that brings points nearest to others, and near to the new ones of these.
+
+    Of equals the shortest. `new` are points of scan 1 that scan 0 saw past: something came there.
+    """
+    reach = int(config.max_motion_m / _MAP_M)
+    steps = np.arange(-reach, reach + 1)
+    cost = _cost(points, others, steps) + 0.01 * _MAP_M * np.hypot(steps[:, None], steps[None, :])
+    low, high = points[:, :2].min(axis=0) - config.max_motion_m, points[:, :2].max(axis=0) + config.max_motion_m
+    new = new[((new[:, :2] > low) & (new[:, :2] < high)).all(axis=1)]
+    if len(new) >= 3:
+        cost += 0.5 * _cost(new, points, steps)[::-1, ::-1]  # what came is moved back
+    i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
+    return np.array([steps[i], steps[j]]) * _MAP_M
+
+
+def _cost(points: F64, others: F64, steps: I64) -> F64:
+    """Mean truncated distance in the ground plane of moved points to others, for all moves by (steps, steps) cells."""
+    margin = int(steps[-1]) * _MAP_M + _TRUNCATE_M
+    low = points[:, :2].min(axis=0) - margin
+    shape = ((points[:, :2].max(axis=0) + margin - low) / _MAP_M).astype(np.int64) + 1
     cell = np.floor((others[:, :2] - low) / _MAP_M).astype(np.int64)
     cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
-    steps = np.arange(-int(reach / _MAP_M), int(reach / _MAP_M) + 1)
     if len(cell) == 0:
-        return np.zeros(2)
+        return np.full((len(steps), len(steps)), _TRUNCATE_M)
     free = np.ones(shape, dtype=bool)
     free[cell[:, 0], cell[:, 1]] = False
     away = np.minimum(ndimage.distance_transform_edt(free) * _MAP_M, _TRUNCATE_M)
-    sample = points[:: max(1, len(points) // _SAMPLE), :2]
+    sample = points[:: -(-len(points) // _COARSE_SAMPLE), :2]
     start = np.floor((sample - low) / _MAP_M).astype(np.int64) + steps[0]
     windows = np.lib.stride_tricks.sliding_window_view(away, (len(steps), len(steps)))
-    cost = windows[start[:, 0], start[:, 1]].mean(axis=0)
-    cost += 0.01 * _MAP_M * np.hypot(steps[:, None], steps[None, :])
-    i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
-    return np.array([steps[i], steps[j]]) * _MAP_M
+    return np.asarray(windows[start[:, 0], start[:, 1]].mean(axis=0))
 
 
 def _with_feet(found: I64, prepared: PreparedScan, config: MoversConfig) -> I64:
