@@ -66,16 +66,12 @@ def _circles(edge_x: F64, edge_z: F64, radius_m: float) -> F64:
         px, pz = edge_x[near] - x, edge_z[near]
         if len(px) < 20:
             continue
-        best = (0.0, 0.0)
-        top = float(pz.max())
-        for z in np.arange(top - 1.35 * radius_m, top - 0.95 * radius_m, 0.01):
-            distance = np.hypot(px, pz - z)
-            for arch in radii:
-                arc = np.abs(px) <= 0.87 * arch
-                expected = 2.0 * 0.87 * arch / _BIN_M
-                share = float(((np.abs(distance - arch) < _ON_ARC_M) & (pz > z) & arc).sum() / expected)
-                if share > best[0] + 1e-9:
-                    best = (share, float(z))
-        if best[0] >= _LEAST_SHARE:
-            found.append((best[0], float(x), best[1]))
+        z = np.arange(float(pz.max()) - 1.35 * radius_m, float(pz.max()) - 0.95 * radius_m, 0.01)
+        distance = np.hypot(px, pz - z[:, None])  # (Z, P)
+        above = (pz > z[:, None])[:, None, :] & (np.abs(px) <= 0.87 * radii[:, None])
+        on_arc = (np.abs(distance[:, None, :] - radii[:, None]) < _ON_ARC_M) & above  # (Z, R, P)
+        share = on_arc.sum(axis=2) / (2.0 * 0.87 * radii / _BIN_M)
+        k = int(np.argmax(share.max(axis=1)))
+        if share[k].max() >= _LEAST_SHARE:
+            found.append((float(share[k].max()), float(x), float(z[k])))
     return np.array(found).reshape(-1, 3)

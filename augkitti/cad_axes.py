@@ -107,39 +107,39 @@ def _turn(points: F64, R: F64) -> F64:
 def mirror_yaw(points: F64) -> tuple[float, float]:
     """The yaw of the vertical mirror plane through points (N, 3), z up, and how badly the mirror image fits.
 
-    The yaw is that of the plane's long direction, in (-90, 90] degrees; within half a degree of the file's own axes
-    these are taken. The misfit is 0 for a perfect mirror image, 1 where the distance to it is 4 % of the diagonal.
+    The yaw is that of the plane's long direction, in [-90, 90) degrees; within half a degree of the file's own axes, or
+    within two where these fit as well, they are taken. The misfit is 0 for a perfect mirror image, 1 where the distance
+    to it is 4 % of the diagonal.
     """
     cap = 0.04 * float(np.sqrt((np.ptp(points, axis=0) ** 2).sum()))
-    few = points[:: max(len(points) // 700, 1)]
-    scores = {}
-    for degrees in range(-90, 90, 3):
-        scores[float(degrees)] = _misfit(few, points, float(degrees), cap)
+    tree = cKDTree(points)
+    few, some = points[:: max(len(points) // 300, 1)], points[:: max(len(points) // 1000, 1)]
+    scores = {float(d): _misfit(few, points, tree, float(d), cap) for d in range(-90, 90, 3)}
     best = min(scores, key=lambda d: (scores[d], d))
-    for step, reach in ((1.0, 3), (0.2, 5), (0.02, 10)):
+    error = scores[best]
+    for step, reach, chosen in ((1.0, 3, few), (0.2, 5, some), (0.02, 10, points)):
         around = [round(best + step * k, 6) for k in range(-reach, reach + 1)]
-        fits = {d: _misfit(few if step > 0.1 else points, points, d, cap) for d in around}
+        fits = {d: _misfit(chosen, points, tree, d, cap) for d in around}
         best = min(fits, key=lambda d: (fits[d], abs(d)))
         error = fits[best]
     nearest = 90.0 * round(best / 90.0)
-    if abs(best - nearest) < 0.5 or (
-        abs(best - nearest) < 2.0 and _misfit(points, points, nearest, cap) < 1.02 * error
-    ):
+    away = abs(best - nearest)
+    if away < 0.5 or (away < 2.0 and _misfit(points, points, tree, nearest, cap) < 1.02 * error):
         best = nearest
     best = (best + 90.0) % 180.0 - 90.0
     return math.radians(best), error
 
 
-def _misfit(some: F64, points: F64, degrees: float, cap: float) -> float:
+def _misfit(some: F64, points: F64, tree: cKDTree, degrees: float, cap: float) -> float:
     """Mean distance, capped and relative to the cap, of mirrored points to the nearest of the others."""
-    R = _about_z(math.radians(degrees))
-    turned, mirrored = _turn(points, R), _turn(some, R)
-    extent = np.ptp(turned, axis=0)
-    if extent[1] >= extent[0]:
+    c, s = _about_z(math.radians(degrees))[0, :2]
+    along, across = c * points[:, 0] + s * points[:, 1], c * points[:, 1] - s * points[:, 0]
+    low, high = across.min(), across.max()
+    if high - low >= along.max() - along.min():
         return 2.0  # across the car's length: not its mirror plane
-    middle = (turned[:, 1].max() + turned[:, 1].min()) / 2.0
-    mirrored = mirrored * [1.0, -1.0, 1.0] + [0.0, 2.0 * middle, 0.0]
-    distance, _ = cKDTree(turned).query(mirrored, distance_upper_bound=cap)
+    beyond = (c * some[:, 1] - s * some[:, 0]) - (low + high) / 2.0
+    mirrored = some - 2.0 * beyond[:, None] * np.array([-s, c, 0.0])
+    distance, _ = tree.query(mirrored, distance_upper_bound=cap)
     return float(np.minimum(distance, cap).mean() / cap)
 
 

@@ -5,6 +5,7 @@ overrides what the heuristics of `cad_alignment.py` find. Finished models are ca
 """
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -281,7 +282,7 @@ def _read_cache(path: Path) -> tuple[CarModel, tuple[str, ...]] | None:
     if not path.is_file():
         return None
     try:
-        with np.load(path, allow_pickle=False) as kept:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as kept:
             text = json.loads(str(kept["text"]))
             model = CarModel(
                 text["name"],

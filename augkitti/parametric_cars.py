@@ -320,22 +320,24 @@ def _add_inside(skin: _Skin, shape: _Shape) -> None:
     half = 0.86 * shape.half_m
     cowl, back = shape.x(s.cowl_m), shape.x(s.back_base_m)
     cabin_end = max(back + 0.15, shape.end_x + 0.1)
-    skin.patch(_sheet(cowl + 0.1, cabin_end, half, floor), OTHER)
+    inner = shape.half_m - shape.tyre_width_m - 0.08  # between the wheel housings
+    skin.patch(_sheet(cowl + 0.1, cabin_end, inner, floor), OTHER)
     skin.box((cowl - 0.32, -half, s.belt_m - 0.32), (cowl + 0.02, half, s.belt_m - 0.04), OTHER)  # dashboard
-    skin.patch(_wall(cowl + 0.05, half, floor, s.belt_m - 0.04), OTHER)
+    skin.patch(_wall(cowl + 0.05, inner, floor, s.belt_m - 0.04), OTHER)
     seat = floor + (0.12 if s.height_m < 1.6 else 0.24)
     front = shape.x(s.screen_top_m) - (0.32 if s.box_m is None else 0.0)
     rows = [(front, 2)] + ([(front - 0.82, 3)] if s.rear_seats else [])
     for x, count in rows:
         if x - 0.6 < cabin_end:
             continue
-        wide = 2.0 * half / count * 0.86
+        room = 2.0 * (half if count == 2 else inner) / count  # the rear bench sits between the wheels
+        wide = 0.86 * room
         for i in range(count):
-            y = (i - (count - 1) / 2.0) * 2.0 * half / count
+            y = (i - (count - 1) / 2.0) * room
             skin.box((x - 0.48, y - wide / 2, seat), (x, y + wide / 2, seat + 0.16), OTHER)
             skin.box((x - 0.6, y - wide / 2, seat + 0.05), (x - 0.46, y + wide / 2, seat + 0.62), OTHER)
             skin.box((x - 0.58, y - 0.13, seat + 0.65), (x - 0.48, y + 0.13, seat + 0.82), OTHER)
-    skin.patch(_wall(cabin_end, half, floor, float(shape.belt(np.array([cabin_end]))[0]) - 0.05), OTHER)
+    skin.patch(_wall(cabin_end, inner, floor, float(shape.belt(np.array([cabin_end]))[0]) - 0.05), OTHER)
     wheel_x, wheel_y, wheel_z = cowl - 0.42, half * 0.5, s.belt_m - 0.12
     ring = np.linspace(0.0, 2.0 * np.pi, 13)
     rims = [np.stack([wheel_x - 0.3 * r * np.sin(ring), wheel_y + r * np.cos(ring), wheel_z + r * np.sin(ring)], 1)
