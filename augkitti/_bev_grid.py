@@ -26,9 +26,9 @@ def cell_of(xy: Array, origin_m: tuple[float, float], cell_m: float, shape: tupl
 
 def cell_centres(origin_m: tuple[float, float], cell_m: float, shape: tuple[int, int]) -> tuple[F64, F64]:
     """x (rows, 1) and y (1, columns) of the cell centres, metres."""
-    x = origin_m[0] + (np.arange(shape[0]) + 0.5) * cell_m
-    y = origin_m[1] + (np.arange(shape[1]) + 0.5) * cell_m
-    return x[:, None], y[None, :]
+    x = origin_m[0] + (np.arange(shape[0], dtype=np.float64)[:, None] + 0.5) * cell_m
+    y = origin_m[1] + (np.arange(shape[1], dtype=np.float64)[None, :] + 0.5) * cell_m
+    return np.asarray(x), np.asarray(y)
 
 
 def interpolate(values: Array, x_cells: Array, y_cells: Array) -> F64:

@@ -44,12 +44,30 @@ class DrivableConfig(_Section):
     low_m: float = Field(default=0.25, gt=0.0, description="what rises higher over the ground is an obstacle")
     car_height_m: float = Field(default=2.0, gt=0.0, description="what hangs higher over the ground is none")
     pass_m: float = Field(default=0.6, gt=0.0, description="a ray lower than this over a gap shows the gap free")
-    kerb_m: float = Field(default=0.04, gt=0.0, description="steps of the ground that a car on the road does not cross")
+    kerb_m: float = Field(default=0.03, gt=0.0, description="a step along a ring from which on it bounds the road")
+    cross_kerb_m: float = Field(default=0.055, gt=0.0, description="the same from ring to ring, where beams differ")
+    rough_m: float = Field(default=0.005, gt=0.0, description="mean stray of heights along a ring; rougher is no road")
+    side_m: float = Field(default=0.3, gt=0.0, description="length to each side over which steps and strays are taken")
+    join_m: float = Field(
+        default=0.6, gt=0.0, description="an edge seen on neighbouring rings is joined over this; far off over more"
+    )
     half_width_m: float = Field(default=0.9, gt=0.0, description="half of the width that a car needs")
 
 
 class MoversConfig(_Section):
     """Unlabelled moving things (`movers.py`)."""
+
+    reach_m: float = Field(60.0, gt=5.0, le=120.0, description="farther points are not tested")
+    min_height_m: float = Field(0.3, gt=0.0, description="what stands lower above the ground is not tested by itself")
+    cell_m: float = Field(0.3, gt=0.05, description="cells of the ground plane that touch form a cluster")
+    min_points: int = Field(6, ge=2, description="smaller clusters are left alone")
+    max_length_m: float = Field(15.0, gt=0.0, description="larger clusters never move (walls, hedges)")
+    max_motion_m: float = Field(3.6, gt=0.0, description="farthest that a thing moves between two scans")
+    min_motion_m: float = Field(0.2, gt=0.0, description="shorter motions are not told from standing")
+    max_misfit_m: float = Field(0.2, gt=0.0, description="a moved cluster must meet the other scan this well")
+    max_misfit_ratio: float = Field(0.85, gt=0.0, lt=1.0, description="and this much better than standing still")
+    min_against: float = Field(0.02, gt=0.0, lt=1.0, description="share of points that contradict standing, at least")
+    min_explained: float = Field(0.6, gt=0.0, lt=1.0, description="share of these that the motion explains")
 
 
 class PlacementConfig(_Section):

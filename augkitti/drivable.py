@@ -1,34 +1,57 @@
-"""Where a car may stand: a scan, its rays and its ground in, a bird's-eye grid of free cells and the road's heading out.
+"""Where a car may stand: a scan, its rays and ground in, a bird's-eye grid of free cells and the road's heading out.
 
-A cell is free when ground was seen in it, or when a ray passed low over it on its way to the next ground behind. Things
-up to car height and kerbs take cells away; what is left must be wide enough for a car and hang together with the road
-under the ego car.
+A cell is free when smooth ground was seen in it, or when a ray passed low over it on its way from one stretch of smooth
+ground to the next. Things up to car height take cells away, and so do edges of the road: along a ring a kerb is a step
+of height and a verge is rough, and what neighbouring rings show of one edge is joined by a line. What is left must be
+wide enough for a car and hang together with the road under the ego car.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
 
-from augkitti._bev_grid import I64, cell_centres, cell_of, interpolate, mean_by_cell
+from augkitti._bev_grid import I64, cell_centres, cell_of, interpolate
 from augkitti.config import DrivableConfig
 from augkitti.frames import F64, Array
 from augkitti.ground import height_at
 from augkitti.scan_pair import Bool, DrivableRegion, GroundMap, Scan, ScanRays
 
 _COLUMNS = 1440  # azimuth columns in which ground is followed outwards: 0.25 degrees, a little more than a firing
+_BLIND_M = 7.0  # the lowest beam meets the ground at 4 m; the ego car hides some of what follows
+_HEADING_REACH_M = 20.0
+_HEADING_SPREAD_RAD = 0.35  # the ego car drives along its road, but turns off now and then
+_LATERAL_BIN_M = 0.2
+_STRAY_LIMIT_M = 0.02  # a single kerb or rail must not make its whole surroundings rough
+_RELIEF_M = 4.0  # slopes wider than this are no kerbs
+_TURN = 10.0  # more than 2 pi: keeps rings apart in one sorted list of azimuths
+
+
+@dataclass(frozen=True, eq=False)
+class _Low:
+    """The points close to the ground, sorted by ring and azimuth."""
+
+    xyz: F64  # (L, 3)
+    range_m: F64  # (L,) seen from above
+    key: F64  # (L,) ring * _TURN + azimuth, ascending
+    ring: I64  # (L,)
+    above: F64  # (L,) over the ground map
+    step_m: F64  # (L,) height difference between the two sides, along the ring
+    rough_m: F64  # (L,) how far heights stray from their neighbours' mean, along the ring
 
 
 def find_drivable_region(scan: Scan, rays: ScanRays, ground: GroundMap, config: DrivableConfig) -> DrivableRegion:
     """The free cells round the ego car that a car can stand on, connected with the road under it."""
     p = scan.xyz.astype(np.float64)
     cells = 2 * int(np.ceil(config.reach_m / config.cell_m))
-    shape = (cells, cells)
-    origin = (-0.5 * cells * config.cell_m, -0.5 * cells * config.cell_m)
-    flat, inside = cell_of(p, origin, config.cell_m, shape)
+    grid = _Grid((-0.5 * cells * config.cell_m, -0.5 * cells * config.cell_m), config.cell_m, (cells, cells))
     above = p[:, 2] - height_at(ground, p)
-    free = _seen_or_passed_over(p, above, inside, origin, shape, ground, config)
-    blocked = _standing(flat, above, inside, shape, config) | _kerbs(p, above, flat, inside, shape, ground, config)
-    region = _connected(free & ~blocked, origin, config)
-    return DrivableRegion(origin, config.cell_m, region, _road_heading(region, origin, config))
+    low = _low_points(p, above, rays, config)
+    edge = (low.step_m > config.kerb_m) | _rough(low, grid, config)
+    free = _seen_or_passed_over(low, edge, ground, grid, config)
+    blocked = _standing(p, above, grid, config) | _edge_lines(low, grid, config) | _kerbs(low, ground, grid, config)
+    region = _connected(free & ~blocked, grid, config)
+    return DrivableRegion(grid.origin_m, grid.cell_m, region, _road_heading(region, grid))
 
 
 def is_drivable(region: DrivableRegion, xy: Array) -> Bool:
@@ -39,66 +62,159 @@ def is_drivable(region: DrivableRegion, xy: Array) -> Bool:
     return np.asarray(inside & region.drivable.ravel()[flat])
 
 
-def _seen_or_passed_over(
-    p: F64,
-    above: F64,
-    inside: Bool,
-    origin: tuple[float, float],
-    shape: tuple[int, int],
-    ground: GroundMap,
-    config: DrivableConfig,
-) -> Bool:
-    """Cells with ground in them, or between two ground returns of one azimuth column with the ray low over the gap."""
-    on_ground = inside & ground.is_ground & (np.abs(above) < config.low_m)
-    q = p[on_ground]
-    r = np.hypot(q[:, 0], q[:, 1])
-    column = ((np.arctan2(q[:, 1], q[:, 0]) + np.pi) * (_COLUMNS / (2.0 * np.pi))).astype(np.int64)
-    order = np.lexsort((r, column))
-    q, r, column = q[order], r[order], column[order]
+@dataclass(frozen=True)
+class _Grid:
+    origin_m: tuple[float, float]
+    cell_m: float
+    shape: tuple[int, int]
+
+    def mark(self, xy: F64) -> Bool:
+        """Cells with at least one of the places (M, 2) in them."""
+        flat, inside = cell_of(xy, self.origin_m, self.cell_m, self.shape)
+        return np.asarray(np.bincount(flat[inside], minlength=self.shape[0] * self.shape[1]).reshape(self.shape) > 0)
+
+    def centres(self) -> tuple[F64, F64]:
+        return cell_centres(self.origin_m, self.cell_m, self.shape)
+
+
+def _low_points(p: F64, above: F64, rays: ScanRays, config: DrivableConfig) -> _Low:
+    r = np.hypot(p[:, 0], p[:, 1])
+    near = np.flatnonzero((np.abs(above) < config.low_m + 0.1) & (r < 1.42 * config.reach_m))
+    key = rays.ring[near] * _TURN + np.arctan2(p[near, 1], p[near, 0])
+    order = np.argsort(key, kind="stable")
+    near, key = near[order], key[order]
+    r, z = np.maximum(r[near], 1.0), p[near, 2]
+    i = np.arange(len(near))
+    total = np.concatenate([[0.0], np.cumsum(z)])
+    a, b = np.searchsorted(key, key - config.side_m / r), np.searchsorted(key, key + config.side_m / r)
+    both = (i > a) & (b > i + 1)
+    left = (total[i] - total[a]) / np.maximum(i - a, 1)
+    right = (total[b] - total[np.minimum(i + 1, b)]) / np.maximum(b - i - 1, 1)
+    stray = np.where(both, np.minimum(np.abs(z - 0.5 * (left + right)), _STRAY_LIMIT_M), 0.0)
+    stray_total = np.concatenate([[0.0], np.cumsum(stray)])
+    return _Low(
+        xyz=p[near],
+        range_m=r,
+        key=key,
+        ring=rays.ring[near].astype(np.int64),
+        above=above[near],
+        step_m=np.where(both, np.abs(right - left), 0.0),
+        rough_m=(stray_total[b] - stray_total[a]) / np.maximum(b - a, 1),
+    )
+
+
+def _rough(low: _Low, grid: _Grid, config: DrivableConfig) -> Bool:
+    """Which low points (L,) lie on rough ground, as grass is; all strays near a point have a say, so a rail has none."""
+    flat, inside = cell_of(low.xyz, grid.origin_m, grid.cell_m, grid.shape)
+    mean, _ = _box_mean(flat[inside], low.rough_m[inside], grid.shape, 3)
+    return np.asarray(mean.ravel()[flat] > config.rough_m)
+
+
+def _seen_or_passed_over(low: _Low, edge: Bool, ground: GroundMap, grid: _Grid, config: DrivableConfig) -> Bool:
+    """Cells with smooth ground in them, or between two such returns of one azimuth with the ray low over the gap."""
+    column = ((low.key - low.ring * _TURN + np.pi) * (_COLUMNS / (2.0 * np.pi))).astype(np.int64)
+    order = np.lexsort((low.range_m, column))
+    q, r, column, smooth = low.xyz[order], low.range_m[order], column[order], ~edge[order]
+    smooth &= np.abs(low.above[order]) < config.low_m
     gap = r[1:] - r[:-1]
     sensor = ground.plane[3] / ground.plane[2]
-    low = sensor * gap / r[1:] < config.pass_m  # the farther return's ray is at most this high over the nearer one
-    bridged = np.flatnonzero((column[1:] == column[:-1]) & low & (gap > 0.0))
-    steps = np.ceil(gap[bridged] / config.cell_m).astype(np.int64) + 1
-    pair = np.repeat(bridged, steps)
-    first = np.cumsum(steps) - steps
-    share = (np.arange(len(pair)) - np.repeat(first, steps)) / np.repeat(np.maximum(steps - 1, 1), steps)
-    between = q[pair, :2] + share[:, None] * (q[pair + 1, :2] - q[pair, :2])
-    flat, there = cell_of(np.concatenate([q[:, :2], between]), origin, config.cell_m, shape)
-    free = np.bincount(flat[there], minlength=shape[0] * shape[1]).reshape(shape) > 0
-    return np.asarray(ndimage.binary_closing(free, iterations=1))
+    passed = sensor * gap / r[1:] < config.pass_m  # how high the farther return's ray is over the nearer return
+    bridged = np.flatnonzero((column[1:] == column[:-1]) & passed & smooth[1:] & smooth[:-1])
+    between = _along(q[bridged, :2], q[bridged + 1, :2], grid.cell_m)
+    first = smooth & (r < _BLIND_M)  # in to the scanner no beam reaches the ground
+    first[1:] &= column[1:] != column[:-1]
+    inwards = _along(np.zeros((int(first.sum()), 2)), q[first, :2], grid.cell_m)
+    return np.asarray(ndimage.binary_closing(grid.mark(np.concatenate([q[smooth, :2], between, inwards]))))
 
 
-def _standing(flat: I64, above: F64, inside: Bool, shape: tuple[int, int], config: DrivableConfig) -> Bool:
+def _along(start: F64, end: F64, step_m: float) -> F64:
+    """Places (K, 2) on the straight lines from starts (M, 2) to ends (M, 2), at most `step_m` apart."""
+    offset = end - start
+    steps = np.ceil(np.hypot(offset[:, 0], offset[:, 1]) / step_m).astype(np.int64) + 1
+    line = np.repeat(np.arange(len(start)), steps)
+    nth = np.arange(len(line)) - np.repeat(np.cumsum(steps) - steps, steps)
+    share = nth / np.maximum(steps - 1, 1)[line]
+    return np.asarray(start[line] + share[:, None] * offset[line])
+
+
+def _standing(p: F64, above: F64, grid: _Grid, config: DrivableConfig) -> Bool:
     """Cells with something in them between kerb and car height."""
-    stands = inside & (above > config.low_m) & (above < config.car_height_m)
-    return np.asarray(np.bincount(flat[stands], minlength=shape[0] * shape[1]).reshape(shape) > 0)
+    return grid.mark(p[(above > config.low_m) & (above < config.car_height_m), :2])
 
 
-def _kerbs(
-    p: F64, above: F64, flat: I64, inside: Bool, shape: tuple[int, int], ground: GroundMap, config: DrivableConfig
-) -> Bool:
-    """Cells in whose surroundings the ground steps up or down by more than a kerb's least height."""
-    smooth = ndimage.gaussian_filter(ground.height_m.astype(np.float64), 2.0 / ground.cell_m)
+def _edge_lines(low: _Low, grid: _Grid, config: DrivableConfig) -> Bool:
+    """Cells with a step along a ring in them, and those on the line to the same edge on one of the next two rings."""
+    at = np.flatnonzero(low.step_m > config.kerb_m)
+    xy, r, ring, key = low.xyz[at, :2], low.range_m[at], low.ring[at], low.key[at]
+    lines = [xy]
+    if len(at):
+        for back in (1, 2):
+            found = np.searchsorted(key, key - back * _TURN)
+            for nearest in (np.maximum(found - 1, 0), np.minimum(found, len(at) - 1)):
+                sideways = np.abs(key - back * _TURN - key[nearest]) * np.minimum(r, r[nearest])
+                outwards = np.abs(r[nearest] - r)
+                joined = (ring[nearest] == ring - back) & (outwards < config.join_m + 0.005 * r * r)
+                joined &= sideways < 0.5 + 0.35 * outwards
+                lines.append(_along(xy[joined], xy[nearest[joined]], grid.cell_m))
+        lines.append(_past_the_ego_car(xy, r, ring, grid.cell_m))
+    return grid.mark(np.concatenate(lines))
+
+
+def _past_the_ego_car(xy: F64, range_m: F64, ring: I64, step_m: float) -> F64:
+    """Lines between edges seen before and behind on one ring, where the kerb between lies too close to be seen."""
+    offset = xy[1:] - xy[:-1]
+    beside = (ring[1:] == ring[:-1]) & (range_m[1:] < _BLIND_M) & (range_m[:-1] < _BLIND_M)
+    beside &= (np.abs(offset[:, 0]) > 1.0) & (np.abs(offset[:, 1]) < 0.4 * np.abs(offset[:, 0]))
+    beside &= np.abs(xy[1:, 1] + xy[:-1, 1]) > 2.4  # wider than the ego car itself
+    return _along(xy[:-1][beside], xy[1:][beside], step_m)
+
+
+def _kerbs(low: _Low, ground: GroundMap, grid: _Grid, config: DrivableConfig) -> Bool:
+    """Cells over which the ground steps by a kerb's height from ring to ring, near the car, where rings lie close.
+
+    The threshold is higher than along a ring: ranges of different beams differ by centimetres.
+    """
+    smooth = ndimage.gaussian_filter(ground.height_m.astype(np.float64), _RELIEF_M / ground.cell_m)
     x0, y0 = ground.origin_m
-    near = inside & (np.abs(above) < config.low_m)
-    q = p[near]
+    flat, inside = cell_of(low.xyz, grid.origin_m, grid.cell_m, grid.shape)
+    q = low.xyz[inside]
     relief = q[:, 2] - interpolate(smooth, (q[:, 0] - x0) / ground.cell_m, (q[:, 1] - y0) / ground.cell_m)
-    mean, count = mean_by_cell(flat[near], relief, shape[0] * shape[1])
-    seen = (count > 0).reshape(shape)
-    height = mean.reshape(shape)
-    highest = ndimage.maximum_filter(np.where(seen, height, -np.inf), size=3)
-    lowest = ndimage.minimum_filter(np.where(seen, height, np.inf), size=3)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(seen & (highest - lowest > config.kerb_m))
+    height, seen = _box_mean(flat[inside], relief, grid.shape, 3)
+    step = np.zeros(grid.shape)
+    for down, right in ((2, 0), (0, 2), (1, 1), (1, -1)):  # from side to side, so that a groove is no step
+        both = _shifted(seen, down, right) & _shifted(seen, -down, -right)
+        jump = np.abs(_shifted(height, down, right) - _shifted(height, -down, -right))
+        step = np.maximum(step, np.where(both, jump, 0.0))
+    return np.asarray(step > config.cross_kerb_m)
 
 
-def _connected(free: Bool, origin: tuple[float, float], config: DrivableConfig) -> Bool:
+def _shifted(values: Array, down: int, right: int) -> Array:
+    """The values `down` rows and `right` columns on, 0 beyond the edge."""
+    out = np.zeros_like(values)
+    rows, columns = values.shape
+    out[max(-down, 0) : rows - max(down, 0), max(-right, 0) : columns - max(right, 0)] = values[
+        max(down, 0) : rows - max(-down, 0), max(right, 0) : columns - max(-right, 0)
+    ]
+    return out
+
+
+def _box_mean(flat: I64, values: F64, shape: tuple[int, int], size: int) -> tuple[F64, Bool]:
+    """Mean of the values in the square of `size` cells round each cell, and where there are any."""
+    count = np.bincount(flat, minlength=shape[0] * shape[1]).reshape(shape).astype(np.float64)
+    total = np.bincount(flat, weights=values, minlength=shape[0] * shape[1]).reshape(shape)
+    ones = np.ones(size)
+    for axis in (0, 1):
+        count = ndimage.convolve1d(count, ones, axis=axis, mode="constant")
+        total = ndimage.convolve1d(total, ones, axis=axis, mode="constant")
+    return np.asarray(total / np.maximum(count, 1.0)), np.asarray(count > 0.5)
+
+
+def _connected(free: Bool, grid: _Grid, config: DrivableConfig) -> Bool:
     """What a disc of half a car's width reaches from the ego car without leaving the free cells."""
-    x, y = cell_centres(origin, config.cell_m, (free.shape[0], free.shape[1]))
+    x, y = grid.centres()
     under_ego = (np.abs(x) < 4.5) & (np.abs(y) < 1.2)  # nothing is seen there, but the ego car stands on road
     free = free | under_ego
-    radius = config.half_width_m / config.cell_m
+    radius = config.half_width_m / grid.cell_m
     core = ndimage.distance_transform_edt(free) > radius
     label, _ = ndimage.label(core)
     near = (np.abs(x) < 8.0) & (np.abs(y) < 2.0) & core
@@ -107,5 +223,29 @@ def _connected(free: Bool, origin: tuple[float, float], config: DrivableConfig) 
     return np.asarray((ndimage.distance_transform_edt(~keep) <= radius) & free) if keep.any() else under_ego & free
 
 
-def _road_heading(region: Bool, origin: tuple[float, float], config: DrivableConfig) -> float:
-    return 0.0
+def _road_heading(region: Bool, grid: _Grid) -> float:
+    """The direction near straight ahead along which the region's edges by the ego car line up best; 0 for none.
+
+    Edge cells are projected across each direction tried; edges along it fall into few lateral bins.
+    """
+    x, y = grid.centres()
+    edge = region & ~ndimage.binary_erosion(region) & (np.abs(x) < _HEADING_REACH_M) & (np.abs(y) < 12.0)
+    rows, columns = np.nonzero(edge)
+    if len(rows) < 20:
+        return 0.0
+    along, across = x[rows, 0], y[0, columns]
+    tried = np.deg2rad(np.arange(-45.0, 45.5, 1.0))
+    bins = int(2 * (_HEADING_REACH_M + 12.0) / _LATERAL_BIN_M)
+    scores = np.empty(len(tried))
+    for k, heading in enumerate(tried):
+        lateral = across * np.cos(heading) - along * np.sin(heading)
+        count = np.bincount((lateral / _LATERAL_BIN_M + bins / 2).astype(np.int64), minlength=bins).astype(np.float64)
+        near = ndimage.gaussian_filter1d(count, 2.0)  # wider than a cell, or the grid's own rows would line up best
+        scores[k] = (near * near).sum() * np.exp(-0.5 * (heading / _HEADING_SPREAD_RAD) ** 2)
+    best = int(np.argmax(scores))
+    if 0 < best < len(tried) - 1:  # between the directions tried: the vertex of the parabola through the best three
+        before, at, after = scores[best - 1 : best + 2]
+        bend = before - 2.0 * at + after
+        shift = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+        return float(tried[best] + shift * (tried[1] - tried[0]))
+    return float(tried[best])

@@ -101,7 +101,8 @@ def _fit_plane(p: F64, config: GroundConfig) -> F64:
         weight = np.exp(-0.5 * ((x / 10.0) ** 2 + (y / 4.0) ** 2))
         level = _ransac(x, y, z, weight, level, config)
     normal = np.array([-level[0], -level[1], 1.0])
-    return np.append(normal, -level[2]) / np.sqrt((normal * normal).sum())
+    plane = np.append(normal, -level[2]) / np.sqrt((normal * normal).sum())
+    return np.asarray(plane, dtype=np.float64)
 
 
 def _ransac(x: F64, y: F64, z: F64, weight: F64, level: F64, config: GroundConfig) -> F64:
