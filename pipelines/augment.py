@@ -12,7 +12,7 @@ from itertools import chain
 
 import numpy as np
 
-from augkitti.augment_pair import augment_pair
+from augkitti.augmentation import augment_pair
 from augkitti.dataset_index import shard_entry
 from augkitti.errors import InputError
 from augkitti.kitti import Sequence, read_pair

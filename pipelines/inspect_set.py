@@ -10,12 +10,12 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from rich.table import Table
 
-from augkitti.config import Config, load_config
+from augkitti.config import load_config
 from augkitti.dataset_index import DatasetIndex
 from augkitti.dataset_info import Motions
 from augkitti.errors import InputError
 from augkitti.scanner import ScannerProfile
-from pipelines.run import cache_folder
+from pipelines.run import cache_folder, config_of
 from pipelines.stage import console
 from pipelines.streets import make_streets, streets_of
 
@@ -155,7 +155,7 @@ def view_pair(folder: Path, pair_id: str | None, picture: Path, kitti: Path | No
     if not len(dataset):
         raise InputError(folder, "holds no pair", "generate some")
     pair = dataset[0 if pair_id is None else pair_id]
-    config = Config.model_validate(dataset.index.configuration)
+    config = config_of(dataset.index)
     profile = set_profile(folder, dataset.index)
     prepared = None
     root = source_of(dataset.index, profile, kitti)
@@ -186,7 +186,7 @@ def set_profile(folder: Path, index: DatasetIndex) -> ScannerProfile:
     if not index.shards:
         return load_profile()
     path = folder / index.shards[0].path
-    return profile_from_content(read_metadata(path).get("profile"), str(path))
+    return profile_from_content(read_metadata(path).get("scanner_profile"), str(path))
 
 
 def source_of(index: DatasetIndex, profile: ScannerProfile, kitti: Path | None, make: bool = False) -> Path | None:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from augkitti.augment_pair import prepare_scan
+from augkitti.augmentation import prepare_scan
 from augkitti.config import Config
 from augkitti.dataset_index import replace_whole
 from augkitti.ego_motion import EgoMotion

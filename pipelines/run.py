@@ -21,6 +21,7 @@ from augkitti.dataset_index import (
     DATA_NAME,
     INDEX_NAME,
     SPLITS_NAME,
+    DatasetIndex,
     file_sha256,
     read_index,
     write_text,
@@ -245,7 +246,13 @@ def is_finished(run: Run) -> bool:
     wanted = shard_metadata(options.config, options.scanner, options.models)
     readable = [shard for shard in index.shards if (out / shard.path).is_file()]
     found = read_metadata(out / readable[0].path) if readable else wanted
-    differs = [key for key in ("version", "config", "profile_digest", "models") if found.get(key) != wanted[key]]
+    told = {
+        "program_version": "program version",
+        "configuration": "configuration",
+        "scanner_profile_digest": "scanner profile",
+        "cad_models": "car models",
+    }
+    differs = [name for key, name in told.items() if found.get(key) != wanted[key]]
     if index.seed != options.seed:
         differs.append("seed")
     names = {f"{DATA_NAME}/{shard.name}.parquet" for shard in run.shards}
@@ -326,6 +333,19 @@ def reopen_run(out: Path) -> Run:
     run = open_run(options)
     start_work(run, resume=True)
     return run
+
+
+def config_of(index: DatasetIndex) -> Config:
+    """The configuration that a data set was made with.
+
+    Raises:
+        InputError: this program has other keys.
+    """
+    try:
+        return Config.model_validate(index.configuration)
+    except ValueError as err:
+        problem = f"was made by augkitti {index.program_version} with settings that this one does not know"
+        raise InputError(INDEX_NAME, problem, "use that version, or generate again") from err
 
 
 def end_work(out: Path) -> None:

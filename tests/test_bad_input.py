@@ -16,7 +16,7 @@ DRIVE = Path("raw/2011_09_26/2011_09_26_drive_0005_sync")
 def kitti(tmp_path_factory):
     root = tmp_path_factory.mktemp("kitti")
     write_drive(root, frames=(0, 1, 2), name=DRIVE.name)
-    write_odometry(root / "odometry")
+    write_odometry(root)
     return root
 
 
