@@ -25,7 +25,7 @@ from augkitti.cad_vehicle import ModelFacts, build_model, content_digest
 from augkitti.errors import InputError
 from augkitti.scan_pair import GLASS, CarModel
 
-LOADER_VERSION = 1  # part of the cache key: raise it when a file would come out differently
+LOADER_VERSION = 2  # part of the cache key: raise it when a file would come out differently
 
 
 @dataclass(frozen=True)

@@ -147,17 +147,16 @@ def finished_model(
     vertices, faces = merge_vertices(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int32))
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     # a nanometre grid hides the last bits, in which processors differ
-    vertices = np.round(vertices - (low + high) / 2.0, 9)
     model = CarModel(
         name,
         category,
-        vertices,
+        np.round(vertices - (low + high) / 2.0, 9),
         faces,
         np.asarray(surface, dtype=np.uint8),
         np.asarray(opacity, dtype=np.float32),
-        np.asarray(high - low),
-        float(wheelbase_m),
-        float(rear_axle_x_m - (low[0] + high[0]) / 2.0),
+        np.round(high - low, 9),
+        round(float(wheelbase_m), 9),
+        round(float(rear_axle_x_m - (low[0] + high[0]) / 2.0), 9),
         "",
     )
     return replace(model, digest=content_digest(model))

@@ -11,6 +11,7 @@ from car_files import turn, write_obj
 from scipy.spatial import cKDTree
 
 from augkitti import cad_models
+from augkitti.cad_formats import read_model
 from augkitti.cad_models import CadLibrary, load_cad_folder
 from augkitti.cad_soup import face_areas
 from augkitti.errors import InputError
@@ -324,3 +325,23 @@ def test_without_the_manifest_at_least_sixteen_are_found_and_none_is_loaded_wron
     assert len(right) >= 16
     left_out = {r.name for r in library.report if r.problem}
     assert left_out | {m.name for m in library.models} == set(truth)
+
+
+@pytest.mark.cad
+def test_the_named_materials_are_glass_and_no_other(described, facts, cad_root):
+    for model in described.models:
+        known = facts[model.name]
+        if not known["glass"]:
+            continue
+        raw = read_model(cad_root / model.name / known["main_file"], cad_root / model.name)
+        names = {part.split(" (")[0] for part in known["glass"][0]["material"].split(", ")}
+        pane = np.array([m.name in names for m in raw.materials])[raw.material]
+        if "exture" in known["glass"][0]["how"]:
+            pane &= raw.opacity < 0.95
+        corners = np.sort(
+            np.round(raw.vertices * known["unit_scale"], 4).view("f8,f8,f8").reshape(-1)[raw.faces[pane]], axis=1
+        )
+        _, once = np.unique(corners, axis=0, return_index=True)  # panes that are in the file twice count once
+        declared = face_areas(raw.vertices * known["unit_scale"], raw.faces[pane][once]).sum()
+        area = face_areas(model.vertices, model.faces)[model.surface == GLASS].sum()
+        assert area == pytest.approx(declared, rel=0.02), model.name
