@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from augkitti.config import Config, PlacementConfig
 from augkitti.drivable import is_drivable
@@ -27,7 +28,16 @@ from augkitti.frames import (
 )
 from augkitti.ground import height_at
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
-from augkitti.scan_pair import Bool, CarModel, GroundMap, LabelledBox, PreparedScan, ScanPair, VirtualCar
+from augkitti.scan_pair import (
+    Bool,
+    CarModel,
+    DrivableRegion,
+    GroundMap,
+    LabelledBox,
+    PreparedScan,
+    ScanPair,
+    VirtualCar,
+)
 from augkitti.scanner import azimuth_time
 from augkitti.vehicle_motion import Drive, bicycle_twist, draw_drive, drive_planar
 
@@ -37,6 +47,10 @@ _EGO_BOX = np.array([-0.45, 0.0, 0.0, 4.9, 1.9, 1.6, 0.0])  # KITTI's car round 
 _TALLEST_M = 4.0  # measured points higher above the ground touch no car
 _TRACK_SHARE = 0.8  # wheels stand this far apart, in parts of the width (which has the mirrors in it)
 _STEEPEST = 0.2  # rise over run: cars stand on roads
+_ROAD_WINDOW_M = 7.0  # half of the window in which the region's long axis is the road
+_ROAD_CELL_M = 0.8  # coarse is fine enough for an axis
+_EGO_ROAD_WEIGHT = 0.15  # of the ego road's axis, against 1 for a line and 0 for a square
+_LARGEST_BEND_RAD = 0.7  # beyond it is another street
 _AZIMUTH_BINS = 1440
 _POSE_BINS = 512  # firing times are this finely resolved where static points are put into the world
 _RETURNED = 0.7  # scanner.md section 3: share of body rays that return, mean over real cars
@@ -66,6 +80,7 @@ class PlacementScene:
     rolling: bool  # whether a body's moment hangs on its bearing
     raw: bool
     cell_xy: F64  # (C, 2) centres of drivable cells of scan 0 within range, velo0
+    cell_heading_rad: F64  # (C,) of the road at these cells, along the ego road rather than against it
     cell_chance: dict[str, F64]  # course to cumulated weights (C,)
     check_times_s: F64  # (K,) from before the first moment to after the last
     label_quads: F64  # (B, K, 4, 2) footprints of labelled boxes in the world, at these times
@@ -85,7 +100,7 @@ def make_scene(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan,
     half = 0.5 * pair.scan0.period_s if rolling else 0.0
     times = np.linspace(-half, interval + half, 9)
     T_world_ego = T_world_scanner(twist, times)
-    cell_xy = _drivable_cells(prepared0, config.placement)
+    cell_xy, cell_heading = _drivable_cells(prepared0.region, config.placement)
     return PlacementScene(
         scans=scans,
         twist=twist,
@@ -93,6 +108,7 @@ def make_scene(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan,
         rolling=rolling,
         raw=raw,
         cell_xy=cell_xy,
+        cell_heading_rad=cell_heading,
         cell_chance=_cell_chances(cell_xy, prepared0.region.road_heading_rad, config.placement),
         check_times_s=times,
         label_quads=_label_quads(pair, twist, times, rolling, config.placement.box_gap_m),
@@ -207,12 +223,41 @@ def _ring_elevation(prepared: PreparedScan) -> F64:
     return np.asarray(np.bincount(ring, weights=prepared.rays.ray_elevation_rad) / np.maximum(count, 1))
 
 
-def _drivable_cells(prepared: PreparedScan, config: PlacementConfig) -> F64:
-    region = prepared.region
+def _drivable_cells(region: DrivableRegion, config: PlacementConfig) -> tuple[F64, F64]:
+    """Drivable cells (C, 2) within range and the road's heading (C,) at each."""
     cells = np.argwhere(region.drivable)
     xy = (cells + 0.5) * region.cell_m + np.asarray(region.origin_m)
     r = np.hypot(xy[:, 0], xy[:, 1])
-    return np.asarray(xy[(r >= config.min_range_m) & (r <= config.max_range_m)])
+    use = (r >= config.min_range_m) & (r <= config.max_range_m)
+    return xy[use], _road_headings(region, cells[use])
+
+
+def _road_headings(region: DrivableRegion, cells: Array) -> F64:
+    """Heading (C,) of the road at cells: the long axis of the region round each, where it has one near the ego road's.
+
+    Second moments of the region in a window; an axis and its opposite are one, hence doubled angles. Where the window
+    has no long axis (squares, junctions) or a side street's, the ego road's own heading stands.
+    """
+    step = max(1, round(_ROAD_CELL_M / region.cell_m))
+    window = 2 * int(_ROAD_WINDOW_M / (step * region.cell_m)) + 1
+    area = region.drivable[step // 2 :: step, step // 2 :: step].astype(np.float64)
+    u = np.arange(area.shape[0])[:, None] * step * region.cell_m
+    v = np.arange(area.shape[1])[None, :] * step * region.cell_m
+    row, column = np.minimum(cells // step, np.array(area.shape) - 1).T
+
+    def mean(values: F64) -> F64:
+        return np.asarray(ndimage.uniform_filter(values, window, mode="constant")[row, column], dtype=np.float64)
+
+    total = np.maximum(mean(area), 1e-9)
+    mu, mv = mean(area * u) / total, mean(area * v) / total
+    uu, vv = mean(area * u * u) / total - mu * mu, mean(area * v * v) / total - mv * mv
+    uv = mean(area * u * v) / total - mu * mv
+    spread = np.maximum(uu + vv, 1e-9)
+    ego = region.road_heading_rad
+    cosine = (uu - vv) / spread + _EGO_ROAD_WEIGHT * np.cos(2.0 * ego)
+    sine = 2.0 * uv / spread + _EGO_ROAD_WEIGHT * np.sin(2.0 * ego)
+    bend = 0.5 * np.asarray(wrap_angle(np.arctan2(sine, cosine) - 2.0 * ego), dtype=np.float64)
+    return ego + np.where(np.abs(bend) < _LARGEST_BEND_RAD, bend, 0.0)
 
 
 def _cell_chances(xy: F64, road_heading_rad: float, config: PlacementConfig) -> dict[str, F64]:
@@ -238,11 +283,9 @@ def _likely_places(
     picks = rng.random(config.candidates)
     if not len(chance) or chance[-1] <= 0.0:
         return np.zeros((0, 2)), np.zeros(0)
-    region = scene.scans[0].prepared.region
-    xy = (
-        scene.cell_xy[np.minimum(np.searchsorted(chance, picks * chance[-1]), len(chance) - 1)] + jitter * region.cell_m
-    )
-    yaw = np.full(len(xy), region.road_heading_rad + drive.heading_rad)
+    cell = np.minimum(np.searchsorted(chance, picks * chance[-1]), len(chance) - 1)
+    xy = scene.cell_xy[cell] + jitter * scene.scans[0].prepared.region.cell_m
+    yaw = scene.cell_heading_rad[cell] + drive.heading_rad
     if scene.raw:
         behind = np.abs(wrap_angle(np.arctan2(xy[:, 1], xy[:, 0]) - np.pi))
         xy, yaw = xy[behind > SEAM_RAD], yaw[behind > SEAM_RAD]
@@ -309,8 +352,11 @@ def _stand(
         elapsed = scene.interval_s + moment1 - moment0
         T_world_car1 = compose(T_world_car0, se3_exp(level_twist, elapsed))
         pose1 = compose(invert(T_world_scanner(scene.twist, scene.interval_s + moment1)), T_world_car1)
+        before = moment1
         if scene.rolling:
             moment1 = azimuth_time(float(np.arctan2(pose1[1, 3], pose1[0, 3])), scene.scans[1].prepared.scan.period_s)
+        if abs(moment1 - before) < 1e-9:
+            break
     on_ground = _pose_on_ground(scene, 1, model, pose1[:2, 3], yaw_of(pose1), moment1, config)
     if on_ground is None:
         return None
@@ -354,7 +400,7 @@ def _pose_on_ground(
     c, s = np.cos(yaw), np.sin(yaw)
     at = xy + np.stack([c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=1)
     here, there = scene.scans[k], scene.scans[1 - k]
-    if not _is_observed(here.prepared.ground, at).all():
+    if not _is_observed(here.prepared.ground, at).any():  # far out beams lie farther apart than axles
         return None
     height = height_at(here.prepared.ground, at)
     contact_world = transform_points(
@@ -364,7 +410,7 @@ def _pose_on_ground(
     if scene.rolling:  # the other scan sees the place when its azimuth passes it
         passes = there.middle_s + float(_moments(scene, 1 - k, other[:, :2].mean(axis=0)[None])[0])
         other = transform_points(invert(T_world_scanner(scene.twist, passes)), contact_world)
-    if not _is_observed(there.prepared.ground, other[:, :2]).all():
+    if not _is_observed(there.prepared.ground, other[:, :2]).any():
         return None
     height = height + 0.5 * (height_at(there.prepared.ground, other[:, :2]) - other[:, 2])
     along = (height[0] + height[1] - height[2] - height[3]) / (2.0 * model.wheelbase_m)
