@@ -360,7 +360,7 @@ def _draw_shape(rng: np.random.Generator, travel_m: float, turns_off: bool) -> S
     lane = float(rng.uniform(3.2, 4.2))
     parking = (bool(rng.random() < 0.5), bool(rng.random() < 0.5))
     half = (lane + 2.3 * parking[0] + 0.2, lane + 2.3 * parking[1] + 0.2)
-    first = min(float(rng.uniform(18.0, 40.0)), 0.4 * travel_m + 25.0) if turns_off else float(rng.uniform(-25.0, 45.0))
+    first = 10.0 + float(rng.uniform(0.1, 0.6)) * travel_m if turns_off else float(rng.uniform(-25.0, 45.0))
     places = [first]
     while places[-1] + 60.0 < travel_m + _BEYOND_M:
         places.append(places[-1] + float(rng.uniform(55.0, 120.0)))
@@ -572,7 +572,7 @@ def _backdrop(shape: Shape, sign: float, rng: np.random.Generator) -> list[Mesh]
     """Back gardens, and the houses along side streets."""
     half, pavement, _ = _side(shape, sign)
     things: list[Mesh] = []
-    for s in np.arange(float(shape.s_m[0]) + 6.0, float(shape.s_m[-1]) - 6.0, 7.0):
+    for s in np.arange(float(shape.s_m[0]) + 6.0, float(shape.s_m[-1]) - 6.0, 5.0):
         at, q = float(s + rng.uniform(-3.0, 3.0)), float(rng.uniform(pavement + 21.0, 62.0))
         if not _clear_of_crossings(shape, sign, at - 8.0, at + 8.0, 3.0):
             continue

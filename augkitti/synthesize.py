@@ -50,6 +50,7 @@ DATE = "2000_01_01"  # a day on which KITTI recorded nothing
 ROAD, SIDEWALK, LAND = 1, 2, 3
 
 _PERIOD_S = 0.1034
+_CLOTHES_RETURN = 0.94
 _SEE_M = 85.0
 _LABEL_M = 75.0  # KITTI's annotators went about this far
 _START = datetime(2000, 1, 1, 12, 0, 1, tzinfo=UTC)
@@ -217,9 +218,12 @@ def scan_street(
         T_body_velo = compose(invert(T_world_body), T_world_velo[used])
         hits = cast_car(body.model, T_body_velo[which], rays, near, profile, opaque_glass=False)
         echoes = simulate_returns(hits, CarLook(body.paint, body.tint), rays, profile, False, rng)
+        seen = echoes.returned
+        if body.model.category in ("Pedestrian", "Cyclist"):  # clothes scatter; the noise model knows cars alone
+            seen = rng.random(len(seen)) < _CLOTHES_RETURN
         first = echoes.stop_m < stop[hits.ray]
         ray = hits.ray[first]
-        stop[ray], returned[ray], measured[ray] = echoes.stop_m[first], echoes.returned[first], echoes.range_m[first]
+        stop[ray], returned[ray], measured[ray] = echoes.stop_m[first], seen[first], echoes.range_m[first]
         reflectance[ray], body_of[ray], material[ray] = echoes.reflectance[first], index, -1
     returned, measured, mixed = _at_edges(stop, returned, measured, rays, (beams, firings), profile, rng)
 
