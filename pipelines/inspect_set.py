@@ -264,3 +264,38 @@ def labelled_motions(kitti: Path, most: int = 500) -> Motions:
         for frame0, _ in sequence.pairs[:run]
     )
     return info_of_pairs(result[0] for result in made if result is not None).labelled
+
+
+def validate_set(folder: Path, kitti: Path | None, jobs: int, report_file: Path | None) -> int:
+    """Check every invariant on every pair and print the first offenders.
+
+    Returns:
+        0, or 1 where anything was found.
+
+    Raises:
+        InputError: the folder is no finished data set, the root holds no KITTI, or the report cannot be written.
+    """
+    from augkitti.dataset_index import read_index, write_text
+    from augkitti.validate import TITLES
+    from augkitti.validate_folder import FOLDER, validate_folder
+
+    index = read_index(folder)
+    root = source_of(index, set_profile(folder, index), kitti, make=True)
+    report = validate_folder(folder, root, jobs)
+    table = Table("", "invariant", "pairs checked", "offences", "not checked", title=str(folder), title_justify="left")
+    for number, title in TITLES.items():
+        checked = f"{report.checked.get(number, 0):,}"
+        table.add_row(
+            str(number), title, checked, f"{report.counts.get(number, 0):,}", report.unchecked.get(number, "")
+        )
+    table.add_row("", "the folder itself", "", f"{report.counts.get(FOLDER, 0):,}", "")
+    console().print(table)
+    for offence in report.first:
+        print(f"{offence.invariant} {offence.pair_id} {offence.column} {offence.value}: {offence.message}")
+    print(f"{report.pairs:,} pairs of {report.shards:,} shards: {sum(report.counts.values()):,} offences")
+    if report_file is not None:
+        try:
+            write_text(report_file, json.dumps(report.as_json(), indent=1) + "\n")
+        except OSError as err:
+            raise InputError(report_file, f"cannot be written ({err.strerror})", "name another file") from err
+    return 0 if report.ok else 1
