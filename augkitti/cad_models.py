@@ -248,7 +248,10 @@ def _load_one(candidate: _Candidate) -> tuple[CarModel, tuple[str, ...]]:
 def _load_cached(candidate: _Candidate, cache_dir: Path | None) -> tuple[CarModel, tuple[str, ...]]:
     if cache_dir is None:
         return _load_one(candidate)
-    path = Path(cache_dir) / f"car-{_files_digest(candidate)}.npz"
+    try:
+        path = Path(cache_dir) / f"car-{_files_digest(candidate)}.npz"
+    except OSError as err:
+        raise InputError(candidate.main, f"its files are not readable ({err.strerror})", "check permissions") from err
     kept = _read_cache(path)
     if kept is not None:
         return kept

@@ -81,6 +81,7 @@ def build_model(
         InputError: axes, unit, wheels or size cannot be told, or contradict the facts.
     """
     said: list[str] = []
+    _check_volume(path, raw)
     R, scale, told = _axes(path, raw, facts, facts_source)
     said += told
     soup = as_soup(raw, R, scale)
@@ -130,6 +131,16 @@ def build_model(
         rear_axle_x_m=ends[1],
     )
     return model, tuple(said)
+
+
+def _check_volume(path: Path, raw: RawModel) -> None:
+    """Refuse what has no width, or is so small, large or far away that lengths cannot be told apart."""
+    used = raw.vertices[np.unique(raw.faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    extent = np.sort(high / 2.0 - low / 2.0) * 2.0
+    far = float(np.abs(used).max())
+    if not (1e-3 < extent[2] < 1e7 and extent[0] > 0.02 * extent[2] and far < 1e4 * extent[2]):
+        raise InputError(path, "is flat, or not of a vehicle's size in any unit", "export the whole vehicle")
 
 
 def finished_model(

@@ -345,3 +345,26 @@ def test_the_named_materials_are_glass_and_no_other(described, facts, cad_root):
         declared = face_areas(raw.vertices * known["unit_scale"], raw.faces[pane][once]).sum()
         area = face_areas(model.vertices, model.faces)[model.surface == GLASS].sum()
         assert area == pytest.approx(declared, rel=0.02), model.name
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        [[0, 0, 0], [0, 0, 0], [0, 0, 0]],
+        [[0, 0, 0], [4, 0, 0], [4, 0, 1.5]],
+        [[1e300, 0, 0], [0, 1e300, 0], [0, 0, 1e300]],
+        [[1e-300, 0, 0], [0, 1e-300, 0], [0, 0, 1e-300]],
+        [[1e9, 0, 0], [1e9 + 4, 1.7, 0], [1e9, 0, 1.5]],
+    ],
+)
+@pytest.mark.parametrize("suffix", ["off", "obj"])
+def test_degenerate_shapes_are_left_out_with_a_reason(tmp_path, points, suffix):
+    rows = [" ".join(f"{v:.17g}" for v in p) for p in points]
+    if suffix == "off":
+        text = "OFF\n3 1 0\n" + "\n".join(rows) + "\n3 0 1 2\n"
+    else:
+        text = "\n".join(f"v {row}" for row in rows) + "\nf 1 2 3\n"
+    (tmp_path / f"bad.{suffix}").write_text(text)
+    with pytest.raises(InputError, match="no usable car model"):
+        load_cad_folder(tmp_path)
