@@ -20,7 +20,7 @@ from augkitti.scan_pair import Bool, DrivableRegion, GroundMap, Scan, ScanRays
 _COLUMNS = 1440  # azimuth columns in which ground is followed outwards: 0.25 degrees, a little more than a firing
 _BLIND_M = 7.0  # the lowest beam meets the ground at 4 m; the ego car hides some of what follows
 _HEADING_REACH_M = 20.0
-_HEADING_SPREAD_RAD = 0.35  # the ego car drives along its road, but turns off now and then
+_HEADING_SPREAD_RAD = 0.6  # the ego car drives along its road, but turns off now and then
 _LATERAL_BIN_M = 0.2
 _STRAY_LIMIT_M = 0.02  # a single kerb or rail must not make its whole surroundings rough
 _RELIEF_M = 4.0  # slopes wider than this are no kerbs
@@ -36,6 +36,7 @@ class _Low:
     key: F64  # (L,) ring * _TURN + azimuth, ascending
     ring: I64  # (L,)
     above: F64  # (L,) over the ground map
+    relief_m: F64  # (L,) over the ground smoothed so far that kerbs stand out of it
     step_m: F64  # (L,) height difference between the two sides, along the ring
     rough_m: F64  # (L,) how far heights stray from their neighbours' mean, along the ring
 
@@ -46,12 +47,12 @@ def find_drivable_region(scan: Scan, rays: ScanRays, ground: GroundMap, config: 
     cells = 2 * int(np.ceil(config.reach_m / config.cell_m))
     grid = _Grid((-0.5 * cells * config.cell_m, -0.5 * cells * config.cell_m), config.cell_m, (cells, cells))
     above = p[:, 2] - height_at(ground, p)
-    low = _low_points(p, above, rays, config)
+    low = _low_points(p, above, rays, ground, config)
     edge = (low.step_m > config.kerb_m) | _rough(low, grid, config)
     free = _seen_or_passed_over(low, edge, ground, grid, config)
-    blocked = _standing(p, above, grid, config) | _edge_lines(low, grid, config) | _kerbs(low, ground, grid, config)
+    blocked = _standing(p, above, grid, config) | _edge_lines(low, grid, config) | _kerbs(low, grid, config)
     region = _connected(free & ~blocked, grid, config)
-    return DrivableRegion(grid.origin_m, grid.cell_m, region, _road_heading(region, grid))
+    return DrivableRegion(grid.origin_m, grid.cell_m, region, _road_heading(blocked, grid))
 
 
 def is_drivable(region: DrivableRegion, xy: Array) -> Bool:
@@ -77,13 +78,16 @@ class _Grid:
         return cell_centres(self.origin_m, self.cell_m, self.shape)
 
 
-def _low_points(p: F64, above: F64, rays: ScanRays, config: DrivableConfig) -> _Low:
+def _low_points(p: F64, above: F64, rays: ScanRays, ground: GroundMap, config: DrivableConfig) -> _Low:
+    smooth = ndimage.gaussian_filter(ground.height_m.astype(np.float64), _RELIEF_M / ground.cell_m)
     r = np.hypot(p[:, 0], p[:, 1])
     near = np.flatnonzero((np.abs(above) < config.low_m + 0.1) & (r < 1.42 * config.reach_m))
     key = rays.ring[near] * _TURN + np.arctan2(p[near, 1], p[near, 0])
     order = np.argsort(key, kind="stable")
     near, key = near[order], key[order]
-    r, z = np.maximum(r[near], 1.0), p[near, 2]
+    r = np.maximum(r[near], 1.0)
+    x, y = (p[near, 0] - ground.origin_m[0]) / ground.cell_m, (p[near, 1] - ground.origin_m[1]) / ground.cell_m
+    z = p[near, 2] - interpolate(smooth, x, y)  # beams along a slope keep their height over any kerb
     i = np.arange(len(near))
     total = np.concatenate([[0.0], np.cumsum(z)])
     a, b = np.searchsorted(key, key - config.side_m / r), np.searchsorted(key, key + config.side_m / r)
@@ -98,13 +102,14 @@ def _low_points(p: F64, above: F64, rays: ScanRays, config: DrivableConfig) -> _
         key=key,
         ring=rays.ring[near].astype(np.int64),
         above=above[near],
+        relief_m=z,
         step_m=np.where(both, np.abs(right - left), 0.0),
         rough_m=(stray_total[b] - stray_total[a]) / np.maximum(b - a, 1),
     )
 
 
 def _rough(low: _Low, grid: _Grid, config: DrivableConfig) -> Bool:
-    """Which low points (L,) lie on rough ground, as grass is; all strays near a point have a say, so a rail has none."""
+    """Which low points (L,) lie on rough ground, as grass is; all strays near a point count, so a rail is not."""
     flat, inside = cell_of(low.xyz, grid.origin_m, grid.cell_m, grid.shape)
     mean, _ = _box_mean(flat[inside], low.rough_m[inside], grid.shape, 3)
     return np.asarray(mean.ravel()[flat] > config.rough_m)
@@ -169,17 +174,13 @@ def _past_the_ego_car(xy: F64, range_m: F64, ring: I64, step_m: float) -> F64:
     return _along(xy[:-1][beside], xy[1:][beside], step_m)
 
 
-def _kerbs(low: _Low, ground: GroundMap, grid: _Grid, config: DrivableConfig) -> Bool:
+def _kerbs(low: _Low, grid: _Grid, config: DrivableConfig) -> Bool:
     """Cells over which the ground steps by a kerb's height from ring to ring, near the car, where rings lie close.
 
     The threshold is higher than along a ring: ranges of different beams differ by centimetres.
     """
-    smooth = ndimage.gaussian_filter(ground.height_m.astype(np.float64), _RELIEF_M / ground.cell_m)
-    x0, y0 = ground.origin_m
     flat, inside = cell_of(low.xyz, grid.origin_m, grid.cell_m, grid.shape)
-    q = low.xyz[inside]
-    relief = q[:, 2] - interpolate(smooth, (q[:, 0] - x0) / ground.cell_m, (q[:, 1] - y0) / ground.cell_m)
-    height, seen = _box_mean(flat[inside], relief, grid.shape, 3)
+    height, seen = _box_mean(flat[inside], low.relief_m[inside], grid.shape, 3)
     step = np.zeros(grid.shape)
     for down, right in ((2, 0), (0, 2), (1, 1), (1, -1)):  # from side to side, so that a groove is no step
         both = _shifted(seen, down, right) & _shifted(seen, -down, -right)
@@ -223,19 +224,19 @@ def _connected(free: Bool, grid: _Grid, config: DrivableConfig) -> Bool:
     return np.asarray((ndimage.distance_transform_edt(~keep) <= radius) & free) if keep.any() else under_ego & free
 
 
-def _road_heading(region: Bool, grid: _Grid) -> float:
-    """The direction near straight ahead along which the region's edges by the ego car line up best; 0 for none.
+def _road_heading(blocked: Bool, grid: _Grid) -> float:
+    """The direction near straight ahead along which edges and walls beside the ego car line up best; 0 for none.
 
-    Edge cells are projected across each direction tried; edges along it fall into few lateral bins.
+    Cells are projected across each direction tried; kerbs and walls along it fall into few lateral bins.
     """
     x, y = grid.centres()
-    edge = region & ~ndimage.binary_erosion(region) & (np.abs(x) < _HEADING_REACH_M) & (np.abs(y) < 12.0)
-    rows, columns = np.nonzero(edge)
+    beside = blocked & (x * x + y * y < _HEADING_REACH_M**2) & (np.abs(y) > 1.2)
+    rows, columns = np.nonzero(beside)
     if len(rows) < 20:
         return 0.0
     along, across = x[rows, 0], y[0, columns]
     tried = np.deg2rad(np.arange(-45.0, 45.5, 1.0))
-    bins = int(2 * (_HEADING_REACH_M + 12.0) / _LATERAL_BIN_M)
+    bins = int(2 * (_HEADING_REACH_M + 2.0) / _LATERAL_BIN_M)
     scores = np.empty(len(tried))
     for k, heading in enumerate(tried):
         lateral = across * np.cos(heading) - along * np.sin(heading)
