@@ -5,7 +5,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
@@ -32,6 +32,7 @@ SPLIT_NAMES = ("train", "validation", "test")
 RATIOS = (70.0, 10.0, 20.0)  # method.md section 2
 GAP_FRAMES = 10  # frames left out where a recording is divided: a second of driving
 _EXACT_RECORDINGS = 9  # up to here every assignment is tried: 3^9 = 19 683
+_CUTS = 40  # places tried where a recording of a toy set is divided
 _STARTS = 12  # of the search beyond
 
 
@@ -135,8 +136,8 @@ def split_frames(
 ) -> dict[str, tuple[str, ...]]:
     """Shard paths by split where there are fewer recordings than splits: one recording is cut up by frames.
 
-    Shards whose frames lie within `GAP_FRAMES` of each other stay together, or one between two pieces is left out of
-    all splits. Reads the frame numbers of the shards.
+    Between two pieces lie more than `GAP_FRAMES` frames: shards in between are left out of all splits. Reads the frame
+    numbers of the shards.
 
     Raises:
         InputError: no recording has enough shards apart in frames.
@@ -317,31 +318,26 @@ def _frame_range(folder: Path, shard: ShardEntry) -> tuple[int, int]:
     return min(first for first, _ in frames), max(last for _, last in frames)
 
 
-def _pieces(shards: list[tuple[ShardEntry, int, int]], needed: int) -> list[list[list[ShardEntry]]]:
-    """Every way to cut a recording's shards, by frame order, into `needed` runs that lie `GAP_FRAMES` apart."""
-    blocks: list[tuple[list[ShardEntry], int, int]] = []  # shards whose frames overlap stay together
-    for shard, first, last in sorted(shards, key=lambda item: (item[1], item[2], item[0].path)):
-        if blocks and first <= blocks[-1][2]:
-            blocks[-1] = ([*blocks[-1][0], shard], blocks[-1][1], max(blocks[-1][2], last))
-        else:
-            blocks.append(([shard], first, last))
-    ways: list[list[list[ShardEntry]]] = []
+def _pieces(shards: list[tuple[ShardEntry, int, int]], needed: int) -> Iterator[list[list[ShardEntry]]]:
+    """Ways to cut a recording's shards, by first frame, into `needed` runs that lie more than `GAP_FRAMES` apart.
 
-    def cut(start: int, left: int, taken: list[tuple[int, int]]) -> None:
-        if left == 0:
-            ways.append([[s for block in blocks[a:b] for s in block[0]] for a, b in taken])
+    Shards between two runs are left out. Of very many shards only some places to cut are tried.
+    """
+    ordered = sorted(shards, key=lambda item: (item[1], item[2], item[0].path))
+    step = max(1, len(ordered) // _CUTS)
+
+    def cut(start: int, left: int, taken: list[list[ShardEntry]]) -> Iterator[list[list[ShardEntry]]]:
+        if left == 1:
+            yield [*taken, [shard for shard, _, _ in ordered[start:]]]
             return
-        ends = range(start + 1, len(blocks) + 1) if left > 1 else [len(blocks)]
-        for end in ends:
-            following = end
-            while left > 1 and following < len(blocks) and blocks[following][1] - blocks[end - 1][2] <= GAP_FRAMES:
-                following += 1  # too near the piece before: left out
-            if end > start and (left == 1 or following < len(blocks)):
-                cut(following, left - 1, [*taken, (start, end)])
+        for end in range(start + 1, len(ordered), step):
+            reach = max(last for _, _, last in ordered[start:end])
+            following = next((i for i in range(end, len(ordered)) if ordered[i][1] - reach > GAP_FRAMES), None)
+            if following is not None:
+                yield from cut(following, left - 1, [*taken, [shard for shard, _, _ in ordered[start:end]]])
 
-    if len(blocks) >= needed:
-        cut(0, needed, [])
-    return ways
+    if len(ordered) >= needed:
+        yield from cut(0, needed, [])
 
 
 def _orders(count: int) -> list[tuple[int, ...]]:
