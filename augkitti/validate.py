@@ -480,8 +480,9 @@ def cars_hide_what_is_behind(pair: AugmentedPair, rules: Rules, source: Source |
         elif len(scan.removed) and not cars:
             yield report.one(f"removed{k}", scan.removed[0], "there is no virtual car to hide it")
         yield from _nothing_stays_behind(pair, rules, report, k, scan)
+        bundle = _bundle(pair, rules, scan) if cars else None
         for item in cars:
-            yield from _body_hides(pair, rules, report, k, scan, item)
+            yield from _body_hides(pair, rules, report, k, scan, item, bundle)
 
 
 def _removed_rows_were_hidden(
@@ -585,8 +586,26 @@ def _beside(rules: Rules, new: Array, old: Array, ring: int) -> list[tuple[int, 
     return [(a, b) for a, b in pairs if abs(d_new[a, 2] - d_old[b, 2]) <= _SAME_RAY_RAD]
 
 
+def _bundle(pair: AugmentedPair, rules: Rules, scan: AugmentedScan) -> tuple[Array, Array] | None:
+    """Fired ticks (F,) of a raw scan, and the measured point (-1: none) of every ring and tick."""
+    if pair.scan_kind != "raw":
+        return None
+    p = rules.profile
+    measured = np.flatnonzero((scan.source >= 0) & (scan.ring < p.beams) & (scan.tick < p.lattice_size))
+    ring, tick = scan.ring[measured].astype(np.int64), scan.tick[measured].astype(np.int64)
+    point = np.full(p.beams * p.lattice_size, -1)
+    point[ring * p.lattice_size + tick] = measured
+    return np.flatnonzero(np.bincount(tick, minlength=p.lattice_size)), point
+
+
 def _body_hides(
-    pair: AugmentedPair, rules: Rules, report: "_Reporter", k: int, scan: AugmentedScan, item: ObjectRecord
+    pair: AugmentedPair,
+    rules: Rules,
+    report: "_Reporter",
+    k: int,
+    scan: AugmentedScan,
+    item: ObjectRecord,
+    bundle: tuple[Array, Array] | None,
 ) -> Iterator[Offence]:
     """At most 1 % of the rays through the middle of the body keep a measured point beyond it."""
     p = rules.profile
@@ -600,20 +619,17 @@ def _body_hides(
     half_m = float(np.hypot(size[0], size[1])) / 2.0
     window = np.pi if centre_m <= half_m + 0.5 else float(np.arcsin(half_m / centre_m)) + np.deg2rad(3.0)
 
-    near = np.abs(wrap_angle(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) - bearing)) <= window + 0.05
-    if pair.scan_kind == "raw":
-        measured = np.flatnonzero((scan.source >= 0) & near & (scan.ring < p.beams) & (scan.tick < p.lattice_size))
-        fired = np.unique(scan.tick[(scan.source >= 0) & (scan.tick < p.lattice_size)]).astype(np.int64)
+    if bundle is not None:
+        fired, point = bundle
         steps = fired[None, :] + p.tick_offset[:, None]
         azimuth = wrap_angle(2.0 * np.pi / p.lattice_size * steps + p.azimuth_rad[:, None] - bearing)
         ring, column = np.nonzero(np.abs(azimuth) <= window)
         tick = fired[column]
         origin, direction = rules.rays(ring, tick)
         times = _times(pair, rules, tick)
-        point = np.full(p.beams * p.lattice_size, -1)
-        point[scan.ring[measured].astype(np.int64) * p.lattice_size + scan.tick[measured]] = measured
         kept = point[ring * p.lattice_size + tick]
     else:
+        near = np.abs(wrap_angle(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]) - bearing)) <= window + 0.05
         index = np.flatnonzero(near & (scan.ring < p.beams))
         origin, direction = rules.lines_to(scan.xyz[index], scan.ring[index])
         times = np.zeros(len(index))
@@ -653,9 +669,13 @@ def cars_have_room(pair: AugmentedPair, rules: Rules, source: Source | None) -> 
         for k, scan in _scans(pair):
             box, pose = _known((item.box0, item.box1)[k]), _known((item.pose0, item.pose1)[k])
             yield from _touches(pair, report, row, k, box)
-            height = transform_points(invert(pose), scan.xyz)[:, 2] + box[5] / 2.0
-            off = (scan.source >= 0) & _in_box(scan.xyz, pose, box[3:6], 0.0) & (height > _UNDERSIDE_M)
-            yield from report.rows(f"xyz{k}", off, scan.xyz, f"is a measured point inside {item.id}", height, "m up")
+            reach = float(np.sqrt((box[3:6] ** 2).sum())) / 2.0
+            near = np.flatnonzero((scan.source >= 0) & (np.abs(scan.xyz - pose[:3, 3]) <= reach).all(axis=1))
+            height = transform_points(invert(pose), scan.xyz[near])[:, 2] + box[5] / 2.0
+            inside = _in_box(scan.xyz[near], pose, box[3:6], 0.0) & (height > _UNDERSIDE_M)
+            off = np.zeros(len(scan), dtype=bool)
+            off[near[inside]] = True
+            yield from report.rows(f"xyz{k}", off, scan.xyz, f"is a measured point inside {item.id}")
         yield from _moves_as_said(pair, report, row, item)
         if pair.scan_kind == "raw":
             yield from _stays_off_the_seam(pair, rules, report, row, item)

@@ -26,6 +26,8 @@ from augkitti.dataset_index import (
     read_index,
 )
 from augkitti.errors import InputError
+from augkitti.ground import fit_ground
+from augkitti.kitti import KittiRoot, open_root, read_scan_rows
 from augkitti.scan_pair import AugmentedPair
 from augkitti.shards import open_shard, read_pairs
 from augkitti.splits import check_splits, read_splits
@@ -99,8 +101,6 @@ def validate_folder(folder: Path | str, kitti_root: Path | str | None = None, jo
     index = read_index(folder)
     root = None if kitti_root is None else Path(kitti_root)
     if root is not None:
-        from augkitti.kitti import open_root
-
         open_root(root)  # a wrong root is answered before any work
     run = Parallel(n_jobs=max(1, min(jobs, len(index.shards))), batch_size=1)
     findings = run(delayed(validate_shard)(folder, shard, root) for shard in index.shards)
@@ -194,6 +194,7 @@ class _Sources:
         except ValueError:  # of another program version: the contract's ground is that of this one
             self.ground = GroundConfig()
         self.kept: dict[tuple[str, int], Any] = {}
+        self.opened: KittiRoot | None = None
 
     def of(self, pair: AugmentedPair) -> Source | None:
         """The pair's source; None where no root was given.
@@ -211,11 +212,10 @@ class _Sources:
         return Source(rows0, rows1, ground0, ground1)
 
     def _read(self, sequence: str, frame: int) -> tuple[Any, Any]:
-        from augkitti.ground import fit_ground
-        from augkitti.kitti import open_root, read_scan_rows
-
         assert self.root is not None
-        rows = read_scan_rows(open_root(self.root).sequence(sequence).scan_path(frame))
+        if self.opened is None:
+            self.opened = open_root(self.root)
+        rows = read_scan_rows(self.opened.sequence(sequence).scan_path(frame))
         valid = np.isfinite(rows).all(axis=1) & (rows != 0.0).any(axis=1)
         return rows, fit_ground(np.ascontiguousarray(rows[valid, :3]), self.ground)
 
