@@ -35,9 +35,12 @@ I64 = npt.NDArray[np.int64]
 _COLUMNS = 2048  # of a range image: 0.176 degrees, the step of a firing
 _TOP_M = 4.0  # above the ground: higher things are leaves, signs and houses
 _TRUNCATE_M = 0.5  # a point without a partner counts as this far off
-_MAP_M = 0.1  # cell of the map on which a cluster is moved about
-_COARSE_SAMPLE = 60  # points of a cluster that are moved about on it
-_SAMPLE = 150  # points of a cluster that are compared with the other scan
+_MAP_M = 0.15  # cell of the map on which a cluster is moved about
+_COARSE_SAMPLE = 50  # points of a cluster that are moved about on it
+_SAMPLE = 90  # points of a cluster that are compared with the other scan
+_PARTNER_M = 0.3  # a point this near to one of the other scan has found it
+_SMOOTH_M = 0.09  # misfit of a body that is met all over
+_BESIDE_M = 1.2  # parts of one car, seen apart
 _CLEAR_M = 0.3  # round a cluster: points of scan 1 this near its new place are to be explained by it
 _EGO_BODY_M = (-3.2, 2.2, 1.5)  # rear, front, side of the ego car round its scanner: mirrors are seen there
 
@@ -47,6 +50,7 @@ class Suspect:
     """A cluster of scan 0 that contradicts the ego-motion, and how well a motion explains it."""
 
     points: I64  # (P,) of scan 0
+    members: I64  # the same among the points that stand out of the ground
     length_m: float  # diagonal in the ground plane
     met: int  # points of scan 1 at its new place
     visible: int  # of its points and of those, how many the other scan could see if it stood
@@ -75,6 +79,22 @@ class _View:
         return np.asarray(np.flatnonzero(((part > low[1:]) & (part < high[1:])).all(axis=1)) + first)
 
 
+@dataclass(frozen=True, eq=False)
+class _Both:
+    """Both scans and what each says of the other."""
+
+    view0: _View
+    view1: _View
+    past0: Bool  # points of view0 that scan 1 sees past
+    past1: Bool
+    hidden0: Bool  # points of view0 that scan 1 cannot see
+    hidden1: Bool
+    tree0: cKDTree
+    tree1: cKDTree
+    new1: I64  # points of view1 that scan 0 saw past
+    tree_new1: cKDTree | None  # of these, in the ground plane
+
+
 def find_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig) -> Bool:
     """Which points (N0,) of scan 0 move against the static world.
 
@@ -85,99 +105,180 @@ def find_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan
         config: bounds.
     """
     moving = np.zeros(len(pair.scan0), dtype=bool)
-    found = [s.points for s in find_suspects(pair, prepared0, prepared1, config) if moves(s, config)]
-    if found:
-        moving[_with_feet(np.concatenate(found), prepared0, config)] = True
+    both = _both(pair, prepared0, prepared1, config)
+    found = [] if both is None else [s for s in _suspects(both, config) if moves(s, config)]
+    if both is not None and found:
+        of_found = np.zeros(len(both.view0.rows), dtype=bool)
+        for suspect in found:
+            of_found[suspect.members] = True
+        of_found[_companions(both, found, of_found, config)] = True
+        moving[_with_feet(both.view0.rows[of_found], prepared0, config)] = True
     if float(np.hypot(pair.ego_motion[0, 3], pair.ego_motion[1, 3])) >= config.min_motion_m:
         moving[_ego_body(prepared0)] = True
     return moving
 
 
+def find_suspects(
+    pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig
+) -> list[Suspect]:
+    """Steps 1 to 3 of the test: for pictures and for tuning."""
+    both = _both(pair, prepared0, prepared1, config)
+    return [] if both is None else list(_suspects(both, config))
+
+
 def moves(suspect: Suspect, config: MoversConfig) -> bool:
     """Step 4 of the test."""
     step = float(np.hypot(suspect.motion_m[0], suspect.motion_m[1]))
-    # What stands aside of its own way contradicts at its two ends only.
+    # What is seen from aside and goes along itself contradicts at its two ends only.
     share = max(config.min_against, 0.3 * min(step / max(suspect.length_m, 0.5), 0.5))
+    better = suspect.misfit_moved_m <= config.max_misfit_ratio * suspect.misfit_still_m
+    # A long flat side meets itself after any move along it: then the ends decide, if they are clear enough.
+    ends = (
+        suspect.misfit_moved_m <= _SMOOTH_M
+        and suspect.explained >= 0.9
+        and suspect.against >= 2.5 * config.min_against * suspect.visible
+    )
     return bool(
         step >= config.min_motion_m
         and suspect.met >= 3
         and len(suspect.points) + suspect.met >= 2 * config.min_points
         and suspect.misfit_moved_m <= config.max_misfit_m
-        and suspect.misfit_moved_m <= config.max_misfit_ratio * suspect.misfit_still_m
+        and (better or ends)
         and suspect.against >= max(4.0, share * suspect.visible)
         and suspect.explained >= config.min_explained
     )
 
 
-def find_suspects(
-    pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig
-) -> Iterator[Suspect]:
-    """Steps 1 to 3 of the test."""
+def _both(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig) -> _Both | None:
     interval_s = max(pair.scan1.time_s - pair.scan0.time_s, 1e-3)
     per_second = se3_log(pair.ego_motion) / interval_s  # T_velo(t)_world = exp(t per_second)
     view0 = _view(prepared0, per_second, 0.0, config)
     view1 = _view(prepared1, per_second, interval_s, config)
     if len(view0.rows) == 0 or len(view1.rows) == 0:
-        return
+        return None
     past0, hidden0 = _look(view1, view0.points)
     past1, hidden1 = _look(view0, view1.points)
-    tree0, tree1 = cKDTree(view0.points), cKDTree(view1.points)
     new1 = np.flatnonzero(past1)
     tree_new1 = cKDTree(view1.points[new1, :2]) if len(new1) else None
-    for members in _clusters(view0.points, config):
-        mine = view0.points[members]
-        low, high = mine.min(axis=0), mine.max(axis=0)
-        length = float(np.hypot(high[0] - low[0], high[1] - low[1]))
-        if len(members) < config.min_points or length > config.max_length_m:
-            continue
-        near = np.zeros(0, dtype=np.int64)
-        if tree_new1 is not None:
-            reach = 0.5 * length + config.max_motion_m
-            near = new1[np.array(sorted(tree_new1.query_ball_point(0.5 * (low + high)[:2], reach)), dtype=np.int64)]
-        if int(past0[members].sum()) + len(near) < max(4.0, config.min_against * len(members)):
-            continue
-        some = members[:: -(-len(members) // _SAMPLE)]
-        if not hidden0[some].all():
-            still = _distance(tree1, view0.points[some[~hidden0[some]]])
-            if (still < 0.15).mean() > 0.97 and hidden0[some].mean() < 0.5:
-                continue  # all of it is met where it stands
-        margin = config.max_motion_m + _TRUNCATE_M
-        others = view1.points[view1.within(low - margin, high + margin)]
-        motion = _best_motion(view0.points[some], others, view1.points[near], config)
-        step = np.array([motion[0], motion[1], 0.0])
-        there = view1.within(low + step - _CLEAR_M, high + step + _CLEAR_M)
-        wide = near[((view1.points[near] > low + step - 1.0) & (view1.points[near] < high + step + 1.0)).all(axis=1)]
-        there = np.union1d(there, wide)
-        if len(there) == 0:
-            continue
-        back = there[:: -(-len(there) // _SAMPLE)]
-        mine, theirs = view0.points[some], view1.points[back]
-        still = _misfit(tree1, mine, hidden0[some], tree0, theirs, hidden1[back])
-        moved = _misfit(
-            tree1, mine + step, _look(view1, mine + step)[1], tree0, theirs - step, _look(view0, theirs - step)[1]
-        )
-        gone, come = members[past0[members]], there[past1[there]]
-        gone_some, come_some = gone[:: -(-len(gone) // _SAMPLE) or 1], come[:: -(-len(come) // _SAMPLE) or 1]
-        left = _distance(tree1, view0.points[gone_some] + step) < config.max_misfit_m * 1.5
-        came = _distance(tree0, view1.points[come_some] - step) < config.max_misfit_m * 1.5
-        explained = (left.mean() if len(left) else 0.0) * len(gone) + (came.mean() if len(came) else 0.0) * len(come)
-        against = len(gone) + len(come)
-        yield Suspect(
-            points=view0.rows[members],
-            length_m=length,
-            met=len(there),
-            visible=int((~hidden0[members]).sum() + (~hidden1[there]).sum()),
-            against=against,
-            explained=float(explained) / max(1, against),
-            motion_m=motion,
-            misfit_still_m=still,
-            misfit_moved_m=moved,
-        )
+    tree0, tree1 = cKDTree(view0.points), cKDTree(view1.points)
+    return _Both(view0, view1, past0, past1, hidden0, hidden1, tree0, tree1, new1, tree_new1)
 
 
-def _misfit(tree1: cKDTree, points0: F64, hidden0: Bool, tree0: cKDTree, points1: F64, hidden1: Bool) -> float:
+def _suspects(both: _Both, config: MoversConfig) -> Iterator[Suspect]:
+    """Of each cluster; where it stands as a whole, of those parts of it that scan 1 sees past."""
+    points = both.view0.points
+    for members in _clusters(points, config):
+        whole = _suspect(both, members, config)
+        if whole is not None:
+            yield whole
+        if whole is None or not moves(whole, config):
+            gone = members[both.past0[members]]
+            if len(gone) < config.min_points or len(gone) == len(members):
+                continue
+            cell = np.floor(points[members, :2] / config.cell_m).astype(np.int64)
+            cell -= cell.min(axis=0) - 1
+            taken = np.zeros(cell.max(axis=0) + 2, dtype=bool)
+            of_gone = cell[both.past0[members]]
+            taken[of_gone[:, 0], of_gone[:, 1]] = True
+            near = members[ndimage.binary_dilation(taken, np.ones((3, 3)))[cell[:, 0], cell[:, 1]]]
+            if len(near) > 0.95 * len(members):
+                continue
+            for part in _clusters(points[near], config):
+                suspect = _suspect(both, near[part], config)
+                if suspect is not None:
+                    yield suspect
+
+
+def _suspect(both: _Both, members: I64, config: MoversConfig) -> Suspect | None:
+    """Step 3 of the test for some points of view0; None where nothing speaks against their standing."""
+    view0, view1 = both.view0, both.view1
+    low, high = view0.points[members].min(axis=0), view0.points[members].max(axis=0)
+    length = float(np.hypot(high[0] - low[0], high[1] - low[1]))
+    if len(members) < config.min_points or length > config.max_length_m:
+        return None
+    near = np.zeros(0, dtype=np.int64)
+    if both.tree_new1 is not None:
+        reach = 0.5 * length + config.max_motion_m
+        found = both.tree_new1.query_ball_point(0.5 * (low + high)[:2], reach)
+        near = both.new1[np.array(sorted(found), dtype=np.int64)]
+    if int(both.past0[members].sum()) + len(near) < max(4.0, config.min_against * len(members)):
+        return None
+    some = _thinned(members)
+    hidden = both.hidden0[some]
+    if hidden.mean() < 0.5:
+        still = _distance(both.tree1, view0.points[some[~hidden]])
+        if (still < 0.15).mean() > 0.97:
+            return None  # all of it is met where it stands
+    margin = config.max_motion_m + _TRUNCATE_M
+    others = view1.points[view1.within(low - margin, high + margin)]
+    judged = [
+        _judge(both, members, low, high, length, near, motion)
+        for motion in _best_motions(view0.points[some], others, view1.points[near], both.tree1, config)
+    ]
+    return min(judged, key=lambda s: s.misfit_moved_m - 0.2 * s.explained, default=None)
+
+
+def _judge(both: _Both, members: I64, low: F64, high: F64, length_m: float, near: I64, motion_m: F64) -> Suspect:
+    """How well a motion explains a cluster."""
+    view0, view1 = both.view0, both.view1
+    step = np.array([motion_m[0], motion_m[1], 0.0])
+    there = view1.within(low + step - _CLEAR_M, high + step + _CLEAR_M)
+    beside = view1.points[near]
+    wide = near[((beside > low + step - 1.0) & (beside < high + step + 1.0)).all(axis=1)]
+    there = np.union1d(there, wide)
+    some, back = _thinned(members), _thinned(there)
+    mine, theirs = view0.points[some], view1.points[back]
+    trees = both.tree1, both.tree0
+    still = _misfit(trees, mine, both.hidden0[some], theirs, both.hidden1[back])
+    moved = _misfit(trees, mine + step, _look(view1, mine + step)[1], theirs - step, _look(view0, theirs - step)[1])
+    gone, come = members[both.past0[members]], there[both.past1[there]]
+    left = _distance(both.tree1, view0.points[_thinned(gone)] + step) < _PARTNER_M
+    came = _distance(both.tree0, view1.points[_thinned(come)] - step) < _PARTNER_M
+    explained = sum(len(all_of) * float(part.mean()) for all_of, part in ((gone, left), (come, came)) if len(all_of))
+    return Suspect(
+        points=view0.rows[members],
+        members=members,
+        length_m=length_m,
+        met=len(there),
+        visible=int((~both.hidden0[members]).sum() + (~both.hidden1[there]).sum()),
+        against=len(gone) + len(come),
+        explained=explained / max(1, len(gone) + len(come)),
+        motion_m=motion_m,
+        misfit_still_m=still,
+        misfit_moved_m=moved,
+    )
+
+
+def _companions(both: _Both, found: list[Suspect], of_found: Bool, config: MoversConfig) -> I64:
+    """Small clusters beside a mover that scan 1 does not meet where they stood but meets after the mover's motion."""
+    points = both.view0.points
+    which = np.repeat(np.arange(len(found)), [len(suspect.members) for suspect in found])
+    tree = cKDTree(points[np.concatenate([suspect.members for suspect in found])][:, :2])
+    rest = np.flatnonzero(~of_found)
+    distance, nearest = tree.query(points[rest, :2], distance_upper_bound=_BESIDE_M)
+    beside = np.full(len(points), -1, dtype=np.int64)
+    beside[rest[np.isfinite(distance)]] = which[nearest[np.isfinite(distance)]]
+    more = [np.zeros(0, dtype=np.int64)]
+    for members in _clusters(points[beside >= 0], config) if (beside >= 0).any() else ():
+        members = np.flatnonzero(beside >= 0)[members]
+        seen = members[~both.hidden0[members]]
+        if len(seen) and (_distance(both.tree1, points[seen]) < 0.2).mean() > 0.3:
+            continue
+        motion = found[int(beside[members[0]])].motion_m
+        moved = points[members] + np.array([motion[0], motion[1], 0.0])
+        if float(_distance(both.tree1, moved).mean()) <= config.max_misfit_m:
+            more.append(members)
+    return np.concatenate(more)
+
+
+def _thinned(members: I64) -> I64:
+    """At most `_SAMPLE` of them, evenly."""
+    return members[:: max(1, -(-len(members) // _SAMPLE))]
+
+
+def _misfit(trees: tuple[cKDTree, cKDTree], points0: F64, hidden0: Bool, points1: F64, hidden1: Bool) -> float:
     """Mean truncated distance (metres) both ways, over what the other scan can see."""
-    both = np.concatenate([_distance(tree1, points0[~hidden0]), _distance(tree0, points1[~hidden1])])
+    both = np.concatenate([_distance(trees[0], points0[~hidden0]), _distance(trees[1], points1[~hidden1])])
     return float(both.mean()) if len(both) else _TRUNCATE_M
 
 
@@ -266,20 +367,36 @@ def _cluster_of(points: F64, config: MoversConfig) -> I64:
     return np.asarray(label[cell[:, 0], cell[:, 1]], dtype=np.int64)
 
 
-def _best_motion(points: F64, others: F64, new: F64, config: MoversConfig) -> F64:
-    """Translation (2,) in the ground plane that brings points nearest to others, and near to the new ones of these.
+def _best_motions(points: F64, others: F64, new: F64, tree1: cKDTree, config: MoversConfig) -> list[F64]:
+    """Translations (2,) in the ground plane that bring points nearest to others; the shortest of equals.
 
-    Of equals the shortest. `new` are points of scan 1 that scan 0 saw past: something came there.
+    The first looks at the points alone, the second also wants to come near to `new`, the points of scan 1 that scan 0
+    saw past: right for what goes along itself, misleading where another thing came there.
     """
     reach = int(config.max_motion_m / _MAP_M)
     steps = np.arange(-reach, reach + 1)
-    cost = _cost(points, others, steps) + 0.01 * _MAP_M * np.hypot(steps[:, None], steps[None, :])
+    far = np.hypot(steps[:, None], steps[None, :])
+    costs = [_cost(points, others, steps) + np.where(far <= reach, 0.01 * _MAP_M * far, 9.0)]
     low, high = points[:, :2].min(axis=0) - config.max_motion_m, points[:, :2].max(axis=0) + config.max_motion_m
     new = new[((new[:, :2] > low) & (new[:, :2] < high)).all(axis=1)]
     if len(new) >= 3:
-        cost += 0.5 * _cost(new, points, steps)[::-1, ::-1]  # what came is moved back
-    i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
-    return np.array([steps[i], steps[j]]) * _MAP_M
+        costs.append(costs[0] + 0.5 * _cost(new, points, steps)[::-1, ::-1])  # what came is moved back
+    motions = []
+    for best in sorted({int(np.argmin(cost)) for cost in costs}):
+        i, j = np.unravel_index(best, costs[0].shape)
+        motions.append(_refined(points, np.array([steps[i], steps[j], 0.0]) * _MAP_M, tree1))
+    return motions
+
+
+def _refined(points: F64, step: F64, tree1: cKDTree) -> F64:
+    """A translation freed of the map's cells: to the mean of the nearest points, three times."""
+    for _ in range(3):
+        distance, partner = tree1.query(points + step, distance_upper_bound=_PARTNER_M)
+        met = np.isfinite(distance)
+        if met.sum() < 3:
+            break
+        step[:2] += (tree1.data[partner[met], :2] - points[met, :2] - step[:2]).mean(axis=0)
+    return np.asarray(step[:2])
 
 
 def _cost(points: F64, others: F64, steps: I64) -> F64:
