@@ -23,6 +23,7 @@ _HEADING_REACH_M = 20.0
 _HEADING_SPREAD_RAD = 0.6  # the ego car drives along its road, but turns off now and then
 _LATERAL_BIN_M = 0.2
 _STRAY_LIMIT_M = 0.02  # a single kerb or rail must not make its whole surroundings rough
+_NEAR_RINGS_M = 20.0  # farther off, neighbouring rings lie more than a metre apart on the ground
 _RELIEF_M = 4.0  # slopes wider than this are no kerbs
 _TURN = 10.0  # more than 2 pi: keeps rings apart in one sorted list of azimuths
 
@@ -179,14 +180,19 @@ def _kerbs(low: _Low, grid: _Grid, config: DrivableConfig) -> Bool:
 
     The threshold is higher than along a ring: ranges of different beams differ by centimetres.
     """
-    flat, inside = cell_of(low.xyz, grid.origin_m, grid.cell_m, grid.shape)
-    height, seen = _box_mean(flat[inside], low.relief_m[inside], grid.shape, 3)
-    step = np.zeros(grid.shape)
+    first = max(0, grid.shape[0] // 2 - int(_NEAR_RINGS_M / grid.cell_m))  # only the middle of the grid
+    side = grid.shape[0] - 2 * first
+    corner = (grid.origin_m[0] + first * grid.cell_m, grid.origin_m[1] + first * grid.cell_m)
+    flat, inside = cell_of(low.xyz, corner, grid.cell_m, (side, side))
+    height, seen = _box_mean(flat[inside], low.relief_m[inside], (side, side), 3)
+    step = np.zeros((side, side))
     for down, right in ((2, 0), (0, 2), (1, 1), (1, -1)):  # from side to side, so that a groove is no step
         both = _shifted(seen, down, right) & _shifted(seen, -down, -right)
         jump = np.abs(_shifted(height, down, right) - _shifted(height, -down, -right))
         step = np.maximum(step, np.where(both, jump, 0.0))
-    return np.asarray(step > config.cross_kerb_m)
+    kerbs = np.zeros(grid.shape, dtype=bool)
+    kerbs[first : first + side, first : first + side] = step > config.cross_kerb_m
+    return kerbs
 
 
 def _shifted(values: Array, down: int, right: int) -> Array:
