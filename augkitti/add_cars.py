@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from augkitti.config import Config
-from augkitti.frames import F32, F64, compose, invert
+from augkitti.frames import F32, F64, compose, invert, points_in_box
 from augkitti.labelled_objects import LabelledObjects, pair_interval
 from augkitti.movers import find_movers
 from augkitti.occlusion import Occluded, keep_nearest
@@ -25,10 +25,11 @@ from augkitti.scan_pair import (
     ScanPair,
     VirtualCar,
 )
-from augkitti.scanner import ScannerProfile
+from augkitti.scanner import ScannerProfile, ray_lines
 from augkitti.scene_flow import scene_flow
 from augkitti.sensor_noise import CarLook, CarReturns, simulate_returns
 
+_SHEAR_M = 0.24  # contract: 0.25 m; less the rounding of coordinates
 _NEAR_M = 0.3  # rays are tried this far round the car's box, beside what it moves within the sweep
 
 
@@ -85,6 +86,26 @@ def seen_well_enough(
     for k, prepared in enumerate((scan0, scan1)):
         simulated = occlude(casts, k, prepared, profile).simulated
         if (np.bincount(simulated.car, minlength=len(casts)) < min_points).any():
+            return False
+    return True
+
+
+def keeps_its_shape(
+    car: VirtualCar, cast: Cast, scan0: PreparedScan, scan1: PreparedScan, profile: ScannerProfile
+) -> bool:
+    """Whether all returns stay by the car's box: the sweep shears a fast car beside the scanner out of it.
+
+    The contract (invariant 4) allows 0.25 m; a car that would be sheared more is no use as a box label either.
+    """
+    for prepared, pose, hits, returns in zip(
+        (scan0, scan1), (car.pose0, car.pose1), cast.hits, cast.returns, strict=True
+    ):
+        ray, rays = hits.ray[returns.returned], prepared.rays
+        origin, direction = ray_lines(
+            profile, rays.ray_ring[ray], rays.ray_azimuth_rad[ray], rays.ray_elevation_rad[ray]
+        )
+        points = origin + returns.range_m[returns.returned, None] * direction
+        if not points_in_box(points, pose, car.model.size_m, _SHEAR_M).all():
             return False
     return True
 

@@ -5,16 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_drive import write_drive
+from tiny_drive import GROUND_Z_M, write_drive
 
 import augkitti
 from augkitti import kitti
+from augkitti.add_cars import cast_and_measure, keeps_its_shape
 from augkitti.augmentation import prepare_scan
 from augkitti.config import Config
-from augkitti.frames import compose, invert, transform_points
+from augkitti.frames import compose, invert, pose_from_xyz_yaw, transform_points
+from augkitti.pair_motion import T_world_scanner, ego_twist
 from augkitti.parametric_cars import parametric_cars
-from augkitti.scan_pair import AugmentedPair, PreparedScan, ScanPair
-from augkitti.scanner import load_profile
+from augkitti.scan_pair import AugmentedPair, PreparedScan, ScanPair, VirtualCar
+from augkitti.scanner import azimuth_time, load_profile
 
 PROFILE = load_profile()
 MODELS = tuple(model for model in parametric_cars() if model.category == "Car")
@@ -126,3 +128,19 @@ def test_compensated_scans_are_cast_as_a_snapshot_without_ticks(kitti_root: Path
     assert (result.scan0.tick == 65535).all()
     assert all(item.moment0 == 0.0 for _, item in virtual(result))
     assert np.count_nonzero(result.scan0.surface) >= 20
+
+
+@pytest.mark.parametrize(("speed_mps", "keeps"), [(34.0, False), (8.0, True)])
+def test_car_that_the_sweep_would_shear_out_of_its_box_is_told(source, speed_mps: float, keeps: bool) -> None:
+    pair, (scan0, _) = source
+    model = MODELS[0]
+    twist_ego = ego_twist(pair.ego_motion, pair.scan1.time_s - pair.scan0.time_s)
+    pose0 = pose_from_xyz_yaw(0.0, 3.0, GROUND_Z_M + model.size_m[2] / 2, 0.0)
+    moment0 = azimuth_time(np.pi / 2, pair.scan0.period_s)
+    T_world_car0 = compose(T_world_scanner(twist_ego, moment0), pose0)
+    twist = np.array([speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0])
+    car = VirtualCar(model, pose0, pose0, moment0, moment0, T_world_car0, twist, speed_mps, 0.0, 0.0, paint=0.9)
+    cast = cast_and_measure(car, pair, scan0, scan0, PROFILE, Config(), np.random.default_rng(0))
+    here = replace(cast, hits=(cast.hits[0],) * 2, returns=(cast.returns[0],) * 2)
+    assert here.returns[0].returned.sum() > 500
+    assert keeps_its_shape(car, here, scan0, scan0, PROFILE) is keeps
