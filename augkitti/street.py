@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from augkitti import street_objects as objects
-from augkitti.frames import F64, Array, footprint_corners, footprints_overlap, yaw_of
+from augkitti.frames import F64, Array, footprints_overlap
 from augkitti.parametric_cars import parametric_cars
 from augkitti.scan_pair import CarModel
 from augkitti.street_objects import Mesh
@@ -26,6 +26,7 @@ _ASIDE_M = 80.0
 _KERB_FACE_M = 0.03
 _CORNER_RADIUS_M = 4.0
 _PATH_STEP_M = 0.05
+_CLEAR_M = 0.25
 
 
 @dataclass(frozen=True)
@@ -108,8 +109,9 @@ def build_street(rng: np.random.Generator, duration_s: float, pace: int) -> Stre
     """
     speed, acceleration = _pace(rng, duration_s, pace)
     travel_m = speed * duration_s + 0.5 * acceleration * duration_s**2
-    shape = _draw_shape(rng, travel_m, turns_off=pace % 5 == 2)
-    ego = _ego_track(shape, rng, speed, acceleration, turns_off=pace % 5 == 2)
+    turns_off = pace % 5 == 2 and travel_m < 70.0  # a side street is no longer than that
+    shape = _draw_shape(rng, travel_m, turns_off)
+    ego = _ego_track(shape, rng, speed, acceleration, turns_off)
     still = objects.joined([ground_mesh(shape), _markings(shape), *_standing_things(shape, rng)])
     bodies = _bodies(shape, ego, duration_s, rng)
     return Street(shape, still, bodies, ego)
@@ -236,8 +238,11 @@ def _apart(values: F64) -> F64:
 def _bend_to_corners(shape: Shape, s: F64, n: F64) -> F64:
     """Shift the net's lines near a side street so that they follow its rounded kerb corners."""
     bent = s.copy()
-    q = np.clip(_beyond_kerb(shape, n), 0.0, _CORNER_RADIUS_M)
+    out = _beyond_kerb(shape, n)
+    q = np.clip(out, 0.0, _CORNER_RADIUS_M)
     flare = _CORNER_RADIUS_M - np.sqrt(np.maximum(_CORNER_RADIUS_M**2 - (_CORNER_RADIUS_M - q) ** 2, 0.0))
+    # On the carriageway the shift runs out towards the centre line: no sheared triangles at its kerb.
+    flare = flare * np.clip(1.0 + out / np.where(n > 0.0, *shape.half_m), 0.0, 1.0)
     for crossing in shape.crossings:
         off = s - crossing.s_m
         beyond = np.abs(off) - crossing.half_width_m
@@ -247,7 +252,7 @@ def _bend_to_corners(shape: Shape, s: F64, n: F64) -> F64:
             np.clip(1.0 - (beyond - 2.0).clip(0.0) / (2.5 * _CORNER_RADIUS_M), 0.0, 1.0),
             np.abs(off) / crossing.half_width_m,
         )
-        there = np.where(n > 0.0, crossing.left, crossing.right) & (_beyond_kerb(shape, n) > 0.0)
+        there = np.where(n > 0.0, crossing.left, crossing.right)
         bent += np.where(there, np.sign(off) * share * flare, 0.0)
     return bent
 
@@ -610,7 +615,7 @@ def _bodies(shape: Shape, ego: Track, duration_s: float, rng: np.random.Generato
     moving = _moving(shape, ego, duration_s, models, rng)
     times = np.arange(-0.1, duration_s + 0.15, 0.1)
     accepted: list[Body] = []
-    taken = [_footprints(ego, times, EGO_SIZE_M, 1.4)]
+    taken = [_footprints(ego, times, EGO_SIZE_M[0], EGO_SIZE_M[1], 1.4)]
     for body in (*parked, *moving):
         corners = _body_footprints(body, times)
         if not any(_touch(corners, others) for others in taken):
@@ -731,22 +736,23 @@ def scanner_poses(street: Street, time_s: Array) -> F64:
     return out
 
 
-def _body_footprints(body: Body, times: F64) -> list[F64]:
+def _body_footprints(body: Body, times: F64) -> F64:
     length, width, _ = body.model.size_m
-    return _footprints(body.track, times, (float(length), float(width), 1.0), -body.model.rear_axle_x_m)
+    return _footprints(body.track, times, float(length), float(width), -body.model.rear_axle_x_m)
 
 
-def _footprints(track: Track, times: F64, size: tuple[float, float, float], ahead_m: float) -> list[F64]:
-    found = []
-    for T in track_poses(track, times):
-        yaw = yaw_of(T)
-        x, y = T[0, 3] + ahead_m * np.cos(yaw), T[1, 3] + ahead_m * np.sin(yaw)
-        found.append(footprint_corners(np.array([x, y, 0.0, size[0], size[1], 1.0, yaw]), 0.25))
-    return found
+def _footprints(track: Track, times: F64, length_m: float, width_m: float, ahead_m: float) -> F64:
+    """Corners (T, 4, 2) on the ground at times, grown by what drivers keep clear."""
+    T = track_poses(track, times)
+    yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+    forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    middle = T[:, :2, 3] + ahead_m * forward
+    half_l, half_w = 0.5 * length_m + _CLEAR_M, 0.5 * width_m + _CLEAR_M
+    signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    return np.stack([middle + a * half_l * forward + b * half_w * left for a, b in signs], axis=1)
 
 
-def _touch(a: list[F64], b: list[F64]) -> bool:
-    for one, two in zip(a, b, strict=True):
-        if np.abs(one.mean(axis=0) - two.mean(axis=0)).max() < 8.0 and footprints_overlap(one, two):
-            return True
-    return False
+def _touch(a: F64, b: F64) -> bool:
+    near = np.abs(a.mean(axis=1) - b.mean(axis=1)).max(axis=1) < 9.0
+    return any(footprints_overlap(a[k], b[k]) for k in np.flatnonzero(near))
