@@ -269,36 +269,48 @@ def test_no_car_hides_behind_a_wall():
         assert car.pose0[0, 3] < 15.0
 
 
-def test_cars_keep_clear_of_labelled_boxes_the_ego_car_and_each_other_all_the_way():
-    T_world_ego, interval = EGO
-    twist = ego_twist(invert(T_world_ego), interval)
-    oncoming0 = LabelledBox("a", "Car", np.array([30.0, 2.0, -1.0, 4.5, 1.8, 1.5, np.pi]))
-    oncoming1 = LabelledBox("a", "Car", np.array([27.5, 2.0, -1.0, 4.5, 1.8, 1.5, np.pi]))
-    parked = LabelledBox("b", "Van", np.array([12.0, -3.0, -1.0, 5.5, 1.9, 2.0, 0.1]))
-    pair, scan0, scan1 = street_pair(boxes0=(), boxes1=(), labels0=(oncoming0, parked), labels1=(oncoming1,))
-    scene = make_scene(pair, scan0, scan1, CONFIG)
-    cars = []
-    for seed in range(30):
-        car = propose(scene, seed, others=cars)
-        if car is not None and len(cars) < 5:
-            cars.append(car)
-    assert len(cars) == 5
-    for i, car in enumerate(cars):
+def test_cars_keep_clear_of_labelled_boxes_all_the_way():
+    oncoming0 = LabelledBox("a", "Car", np.array([22.0, 1.5, -1.0, 4.5, 1.8, 1.5, np.pi]))
+    oncoming1 = LabelledBox("a", "Car", np.array([18.5, 1.5, -1.0, 4.5, 1.8, 1.5, np.pi]))  # seen from 1 m farther on
+    parked = LabelledBox("b", "Van", np.array([12.0, -1.5, -1.0, 5.5, 1.9, 2.0, 0.1]))  # labelled in scan 0 only
+    pair, scan0, scan1 = street_pair(
+        boxes0=(), boxes1=(), labels0=(oncoming0, parked), labels1=(oncoming1,), road_m=(5.0, 32.0, -4.0, 4.0)
+    )
+    for car in proposals(make_scene(pair, scan0, scan1, CONFIG), 40):
         for k, labels in enumerate(((oncoming0, parked), (oncoming1,))):
             mine = footprint_corners(car_box(car.model, car.pose1 if k else car.pose0))
-            theirs = [label.box for label in labels]
-            theirs += [car_box(c.model, c.pose1 if k else c.pose0) for c in cars[:i]]
-            assert not any(footprints_overlap(mine, footprint_corners(box)) for box in theirs)
-        for t in np.linspace(0.0, interval, 15):
-            mine = footprint_corners(car_box(car.model, T_world_car(car, t)))
-            ego = footprint_corners(np.array([-0.45, 0.0, 0.0, 4.9, 1.9, 1.5, 0.0]))
-            in_ego = footprint_corners(
-                car_box(car.model, compose(invert(T_world_scanner(twist, t)), T_world_car(car, t)))
-            )
-            assert not footprints_overlap(in_ego, ego)
+            assert not any(footprints_overlap(mine, footprint_corners(label.box)) for label in labels)
+        for share in np.linspace(0.0, 1.0, 11):
+            mine = footprint_corners(car_box(car.model, T_world_car(car, share * PERIOD_S)))
+            between = oncoming0.box + share * np.array([-2.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            assert not footprints_overlap(mine, footprint_corners(between))
             assert not footprints_overlap(mine, footprint_corners(parked.box))
-            for other in cars[:i]:
-                assert not footprints_overlap(mine, footprint_corners(car_box(other.model, T_world_car(other, t))))
+
+
+def test_cars_keep_clear_of_the_ego_car_all_the_way():
+    T_world_ego, interval = EGO
+    twist = ego_twist(invert(T_world_ego), interval)
+    pair, scan0, scan1 = street_pair(boxes0=(), boxes1=(), road_m=(-9.0, 9.0, -5.0, 5.0))
+    config = Config.model_validate({"placement": {"min_range_m": 0.0}, "min_points": 1})
+    ego = footprint_corners(np.array([-0.45, 0.0, 0.0, 4.9, 1.9, 1.5, 0.0]))
+    for car in proposals(make_scene(pair, scan0, scan1, config), 30, config=config):
+        for t in np.linspace(0.0, interval, 15):
+            T_scanner_car = compose(invert(T_world_scanner(twist, t)), T_world_car(car, t))
+            assert not footprints_overlap(footprint_corners(car_box(car.model, T_scanner_car)), ego)
+
+
+def test_cars_keep_clear_of_each_other_all_the_way():
+    pair, scan0, scan1 = street_pair(boxes0=(), boxes1=(), road_m=(5.0, 32.0, -4.0, 4.0))
+    scene = make_scene(pair, scan0, scan1, CONFIG)
+    for seed in range(5):
+        first = propose(scene, seed)
+        for car in proposals(scene, 20, others=(first,)):
+            for mine, theirs in ((car.pose0, first.pose0), (car.pose1, first.pose1)):
+                boxes = car_box(car.model, mine), car_box(first.model, theirs)
+                assert not footprints_overlap(*map(footprint_corners, boxes))
+            for t in np.linspace(0.0, PERIOD_S, 11):
+                boxes = car_box(car.model, T_world_car(car, t)), car_box(first.model, T_world_car(first, t))
+                assert not footprints_overlap(*map(footprint_corners, boxes))
 
 
 @pytest.mark.parametrize(("kind", "shutter"), [("compensated", "rolling"), ("raw", "snapshot")])
