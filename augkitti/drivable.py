@@ -18,7 +18,8 @@ from augkitti.ground import height_at
 from augkitti.scan_pair import Bool, DrivableRegion, GroundMap, Scan, ScanRays
 
 _COLUMNS = 1440  # azimuth columns in which ground is followed outwards: 0.25 degrees, a little more than a firing
-_BLIND_M = 7.0  # the lowest beam meets the ground at 4 m; the ego car hides some of what follows
+_UNSEEN_M = 4.2  # no beam meets the ground nearer than 4 m, at KITTI's height
+_BLIND_M = 7.0  # the first ground seen lies nearer than this, where the ego car does not hide it
 _HEADING_REACH_M = 20.0
 _HEADING_SPREAD_RAD = 0.6  # the ego car drives along its road, but turns off now and then
 _LATERAL_BIN_M = 0.2
@@ -172,7 +173,8 @@ def _past_the_ego_car(xy: F64, range_m: F64, ring: I64, step_m: float) -> F64:
     beside = (ring[1:] == ring[:-1]) & (range_m[1:] < _BLIND_M) & (range_m[:-1] < _BLIND_M)
     beside &= (np.abs(offset[:, 0]) > 1.0) & (np.abs(offset[:, 1]) < 0.4 * np.abs(offset[:, 0]))
     beside &= np.abs(xy[1:, 1] + xy[:-1, 1]) > 2.4  # wider than the ego car itself
-    return _along(xy[:-1][beside], xy[1:][beside], step_m)
+    line = _along(xy[:-1][beside], xy[1:][beside], step_m)
+    return np.asarray(line[np.hypot(line[:, 0], line[:, 1]) < _UNSEEN_M])
 
 
 def _kerbs(low: _Low, grid: _Grid, config: DrivableConfig) -> Bool:
