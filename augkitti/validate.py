@@ -29,6 +29,7 @@ from augkitti.frames import (
     wrap_angle,
     yaw_of,
 )
+from augkitti.ground import height_at
 from augkitti.scan_pair import (
     LAMP,
     MEASURED,
@@ -72,6 +73,10 @@ _WHEEL_M = 0.10  # contract, invariant 10
 _WHEELS = (0.3, 0.4)  # parts of length and width at which wheels touch the ground, either way
 _SEAM_RAD = np.deg2rad(15.0)  # contract, frames
 _SEAM_SLACK_RAD = np.deg2rad(0.5)  # a box is a little wider than the mesh in it
+_LABEL_ABOVE_M = 0.15  # contract, columns: lower points in a labelled box are ground
+_SHELL_M = 0.2  # contract, columns: round a moving labelled box the flow is not known
+_SLACK_M = 0.01
+_SURELY_MOVING_MPS = 1.0  # a label slower than this may be one that stands
 _MOVING_MPS = 0.1
 _MOMENT_S = 0.003  # the revolution's time is not in the shard: time1 - time0 stands for it
 
@@ -344,10 +349,32 @@ def instances_agree(pair: AugmentedPair, rules: Rules, source: Source | None) ->
             off = np.zeros(len(scan), dtype=bool)
             off[mine[outside]] = True
             yield from report.rows(f"xyz{k}", off, scan.xyz, message)
+        if source is not None:
+            yield from _points_of_labels(pair, report, k, scan, (source.ground0, source.ground1)[k])
+
+
+def _points_of_labels(
+    pair: AugmentedPair, report: "_Reporter", k: int, scan: AugmentedScan, ground: GroundMap
+) -> Iterator[Offence]:
+    """Measured points well inside a labelled box and above the ground belong to a labelled object."""
+    for row, item in enumerate(pair.objects):
+        box = (item.box0, item.box1)[k]
+        if item.origin != "labelled" or box is None:
+            continue
+        reach = float(np.sqrt((box[3:6] ** 2).sum())) / 2.0
+        near = np.flatnonzero((scan.source >= 0) & (np.abs(scan.xyz - box[:3]) <= reach).all(axis=1))
+        near = near[_in_box(scan.xyz[near], box_pose(box), box[3:6], -_SLACK_M)]
+        near = near[scan.xyz[near, 2] - height_at(ground, scan.xyz[near, :2]) > _LABEL_ABOVE_M + _SLACK_M]
+        off = np.zeros(len(scan), dtype=bool)
+        off[near] = scan.instance[near] < 0
+        yield from report.rows(f"instance{k}", off, scan.instance, f"of a point in the box of objects[{row}] is -1")
 
 
 def flow_is_the_motion(pair: AugmentedPair, rules: Rules, source: Source | None) -> Iterator[Offence]:
-    """Invariant 5; at status 1 the flow is that of the static world."""
+    """Invariant 5; at status 1 the flow is that of the static world.
+
+    Also where the contract wants status 1: round a moving label, and on one straight behind in a raw scan.
+    """
     report = _Reporter(pair, 5)
     scan = pair.scan0
     xyz = scan.xyz.astype(np.float64)
@@ -355,12 +382,19 @@ def flow_is_the_motion(pair: AugmentedPair, rules: Rules, source: Source | None)
     unknown = pair.flow_status0 != 0
     for row, item in enumerate(pair.objects):
         mine = (scan.instance == row) & ~unknown
-        if not mine.any():
-            continue
         if item.motion is None:
             yield from report.rows("flow_status0", mine, pair.flow_status0, f"is 0, objects[{row}] has no motion")
         else:
             moved[mine] = transform_points(item.motion, xyz[mine])
+        box = item.box0
+        if item.origin != "labelled" or box is None:
+            continue
+        if pair.scan_kind == "raw" and abs(wrap_angle(np.arctan2(box[1], box[0]) - np.pi)) < _SEAM_RAD:
+            yield from report.rows("flow_status0", mine, pair.flow_status0, "is 0 on a label straight behind")
+        if abs(item.speed or 0.0) > _SURELY_MOVING_MPS:
+            shell = _in_box(scan.xyz, box_pose(box), box[3:6], _SHELL_M - _SLACK_M)
+            shell &= ~_in_box(scan.xyz, box_pose(box), box[3:6], _SLACK_M) & (scan.instance < 0) & ~unknown
+            yield from report.rows("flow_status0", shell, pair.flow_status0, f"is 0 round the moving objects[{row}]")
     error = np.sqrt(((moved - xyz - pair.flow0) ** 2).sum(axis=1))
     bad = ~(error <= 1e-4)
     yield from report.rows("flow0", bad & ~unknown, pair.flow0, "is not its object's motion", error, "m off")
@@ -718,8 +752,6 @@ def cars_stand_on_the_ground(pair: AugmentedPair, rules: Rules, source: Source |
     """Invariant 10: four wheels against the height map of each source scan."""
     if source is None:
         return
-    from augkitti.ground import height_at
-
     report = _Reporter(pair, 10)
     for row, item in enumerate(pair.objects):
         if not _has_poses(item):

@@ -181,6 +181,28 @@ def test_labelled_point_outside_its_box_is_found(pair):
     assert found(with_object(broken, LABELLED, points1=pair.objects[LABELLED].points1 + 1)) == {4}
 
 
+def test_label_that_lacks_its_points_is_found(pair, source):
+    item = pair.objects[LABELLED]
+    wide = np.array([0, 0, 0, 0.1, 0.1, 0.1, 0])  # labels are a little wider than cars
+    loose = with_object(pair, LABELLED, box0=item.box0 + wide, box1=item.box1 + wide)
+    assert found(loose, source) == set()
+    row = int(np.flatnonzero(pair.scan1.instance == LABELLED)[100])
+    broken = with_scan(loose, 1, instance=changed(pair.scan1.instance, row, -1))
+    broken = with_object(broken, LABELLED, points1=item.points1 - 1)
+    assert found(broken, source) == {4}
+    assert found(broken) == set()
+
+
+def test_known_flow_round_a_moving_label_is_found(pair):
+    assert found(with_object(pair, LABELLED, speed=5.0)) == {5}
+
+
+def test_known_flow_of_a_label_straight_behind_is_found(pair):
+    box = changed(pair.objects[LABELLED].box0, [0, 1], [-12.0, 0.5])
+    messages = [offence.message for offence in validate_pair(with_object(pair, LABELLED, box0=box), RULES)]
+    assert any("straight behind" in message for message in messages)
+
+
 @pytest.mark.parametrize("which", [measured, simulated])
 def test_flow_off_by_a_centimetre_is_found(pair, which):
     row = which(pair.scan0)
