@@ -377,7 +377,7 @@ def draw_info(info: Info, path: Path) -> None:
         axes[1, 1].bar_label(bars, [f"{s:.1f}" for s in shares], padding=3, fontsize=9)
         axes[1, 1].set_yticks(range(len(names)), names)
         axes[1, 1].invert_yaxis()
-        axes[1, 1].set(xlabel="% of simulated points", xlim=(0.0, max(1.0, float(shares.max())) * 1.15))
+        axes[1, 1].set(xlabel="% of simulated points", xlim=(0.0, max(1.0, float(shares.max())) * 1.3))
 
         sequences = sorted(info.pairs_of_sequence.items(), key=lambda entry: -entry[1])
         shown = sequences[:12]
