@@ -331,6 +331,9 @@ def instances_agree(pair: AugmentedPair, rules: Rules, source: Source | None) ->
             count = (item.points0, item.points1)[k]
             if count != counts[row]:
                 yield report.one(f"objects[{row}].points{k}", count, f"the scan has {counts[row]}")
+            rays = (item.rays0, item.rays1)[k]
+            if item.origin == "virtual" and rays is not None and rays < count:
+                yield report.one(f"objects[{row}].rays{k}", rays, f"are fewer than its {count} returns")
             mine = np.flatnonzero(owned & (scan.instance == row))
             box, pose = (item.box0, item.box1)[k], (item.pose0, item.pose1)[k]
             if len(mine) == 0:

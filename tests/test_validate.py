@@ -159,6 +159,10 @@ def test_bad_count_is_found(pair):
     assert found(with_object(pair, LABELLED, points0=pair.objects[LABELLED].points0 + 1)) == {4}
 
 
+def test_fewer_rays_than_returns_are_found(pair):
+    assert found(with_object(pair, CAR, rays1=pair.objects[CAR].points1 - 1)) == {4}
+
+
 def test_mixed_point_with_an_instance_is_found(pair):
     row = int(np.flatnonzero(pair.scan1.surface == 7)[0])
     assert 4 in found(with_scan(pair, 1, instance=changed(pair.scan1.instance, row, CAR)))
