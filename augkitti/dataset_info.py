@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from augkitti.dataset import open_dataset
+from augkitti.dataset import Dataset
 from augkitti.draw import CAR_COLOURS, SURFACE_COLOURS, figure_to
 from augkitti.frames import F64, compose, invert, se3_exp, se3_log, yaw_of
 from augkitti.scan_pair import SURFACE_NAMES, AugmentedPair, ObjectRecord
@@ -118,8 +118,6 @@ def dataset_info(folder: Path, labelled: Motions | None = None) -> Info:
     Raises:
         InputError: no data set there, or an unreadable shard.
     """
-    from augkitti.dataset import Dataset
-
     return info_of_pairs(Dataset(folder), labelled)
 
 
