@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from augkitti.errors import InputError
 
@@ -73,53 +73,76 @@ class MoversConfig(_Section):
 class PlacementConfig(_Section):
     """Where cars are put (`placement.py`)."""
 
-    attempts: int = Field(24, ge=1, description="proposals a pair before it is left out for want of room")
-    candidates: int = Field(512, ge=1, description="places looked at for each drawn motion")
-    full_checks: int = Field(12, ge=1, description="of these, places whose points and boxes are looked at")
-    min_range_m: float = Field(4.0, ge=0.0, description="nearest distance of a car's centre from the scanner")
+    attempts: int = Field(default=24, ge=1, description="proposals a pair before it is left out for want of room")
+    candidates: int = Field(default=512, ge=1, description="places looked at for each drawn motion")
+    full_checks: int = Field(default=12, ge=1, description="of these, places whose points and boxes are looked at")
+    min_range_m: float = Field(default=4.0, ge=0.0, description="nearest distance of a car's centre from the scanner")
     max_range_m: float = Field(
-        60.0, gt=0.0, description="farthest; distances between are drawn evenly where there is room"
+        default=60.0, gt=0.0, description="farthest; distances between are drawn evenly where there is room"
     )
     wrong_side_weight: float = Field(
-        0.2, ge=0.0, le=1.0, description="weight of places on the wrong side of a road with right-hand traffic"
+        default=0.2, ge=0.0, le=1.0, description="weight of places on the wrong side of a road with right-hand traffic"
     )
     box_gap_m: float = Field(
-        0.5, ge=0.0, description="free space to labelled boxes, other virtual cars and the ego car"
+        default=0.5, ge=0.0, description="free space to labelled boxes, other virtual cars and the ego car"
     )
-    point_gap_m: float = Field(0.15, ge=0.0, description="free space to measured points, round the car's box")
+    point_gap_m: float = Field(default=0.15, ge=0.0, description="free space to measured points, round the car's box")
     point_height_m: float = Field(
-        0.2, gt=0.0, le=0.35, description="measured points lower above the underside are ground (contract: 0.35)"
+        default=0.2,
+        gt=0.0,
+        le=0.35,
+        description="measured points lower above the underside are ground (contract: 0.35)",
     )
-    ground_gap_m: float = Field(0.07, gt=0.0, le=0.1, description="wheels to the ground of each scan (contract: 0.10)")
+    ground_gap_m: float = Field(
+        default=0.07, gt=0.0, le=0.1, description="wheels to the ground of each scan (contract: 0.10)"
+    )
     min_free_share: float = Field(
-        0.25, ge=0.0, le=1.0, description="share of rays to the car that nothing stops before"
+        default=0.25, ge=0.0, le=1.0, description="share of rays to the car that nothing stops before"
     )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "PlacementConfig":
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError("min_range_m must be below max_range_m")
+        return self
 
 
 class MotionConfig(_Section):
     """How cars move (`vehicle_motion.py`)."""
 
-    standing_share: float = Field(0.10, ge=0.0, description="weight of standing cars")
-    slow_share: float = Field(0.25, ge=0.0, description="weight of cars slower than `slow_mps`")
-    town_share: float = Field(0.35, ge=0.0, description="weight of cars between `slow_mps` and `town_mps`")
-    fast_share: float = Field(0.30, ge=0.0, description="weight of cars between `town_mps` and `fast_mps`")
-    slow_mps: float = Field(4.0, gt=0.0, description="upper end of slow speeds")
-    town_mps: float = Field(15.0, gt=0.0, description="upper end of town speeds")
-    fast_mps: float = Field(34.0, gt=0.0, description="highest speed")
-    moving_mps: float = Field(1.0, ge=0.0, description="least speed of a car that must move")
-    reversing_share: float = Field(0.1, ge=0.0, le=1.0, description="share of the slow cars that drive backwards")
-    along_share: float = Field(0.60, ge=0.0, description="weight of headings along the ego road axis")
-    against_share: float = Field(0.25, ge=0.0, description="weight of headings against it")
-    turning_share: float = Field(0.15, ge=0.0, description="weight of turning or crossing cars, half of each")
-    heading_spread_rad: float = Field(0.08, ge=0.0, description="standard deviation of headings about the road axis")
+    standing_share: float = Field(default=0.10, ge=0.0, description="weight of standing cars")
+    slow_share: float = Field(default=0.25, ge=0.0, description="weight of cars slower than `slow_mps`")
+    town_share: float = Field(default=0.35, ge=0.0, description="weight of cars between `slow_mps` and `town_mps`")
+    fast_share: float = Field(default=0.30, ge=0.0, description="weight of cars between `town_mps` and `fast_mps`")
+    slow_mps: float = Field(default=4.0, gt=0.0, description="upper end of slow speeds")
+    town_mps: float = Field(default=15.0, gt=0.0, description="upper end of town speeds")
+    fast_mps: float = Field(default=34.0, gt=0.0, description="highest speed")
+    moving_mps: float = Field(default=1.0, ge=0.0, description="least speed of a car that must move")
+    reversing_share: float = Field(
+        default=0.1, ge=0.0, le=1.0, description="share of the slow cars that drive backwards"
+    )
+    along_share: float = Field(default=0.60, ge=0.0, description="weight of headings along the ego road axis")
+    against_share: float = Field(default=0.25, ge=0.0, description="weight of headings against it")
+    turning_share: float = Field(default=0.15, ge=0.0, description="weight of turning or crossing cars, half of each")
+    heading_spread_rad: float = Field(
+        default=0.08, ge=0.0, description="standard deviation of headings about the road axis"
+    )
     crossing_spread_rad: float = Field(
-        0.3, ge=0.0, description="standard deviation of crossing headings about 90 degrees"
+        default=0.3, ge=0.0, description="standard deviation of crossing headings about 90 degrees"
     )
-    max_steering_rad: float = Field(0.6, gt=0.0, lt=1.5, description="largest steering angle")
-    max_lateral_mps2: float = Field(4.0, gt=0.0, description="largest lateral acceleration of the rear axle")
+    max_steering_rad: float = Field(default=0.6, gt=0.0, lt=1.5, description="largest steering angle")
+    max_lateral_mps2: float = Field(default=4.0, gt=0.0, description="largest lateral acceleration of the rear axle")
     steering_spread: float = Field(
-        0.4, ge=0.0, description="standard deviation of steering along the road, in parts of what the two limits allow"
+        default=0.4,
+        ge=0.0,
+        description="standard deviation of steering along the road, in parts of what the two limits allow",
     )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "MotionConfig":
+        if not self.slow_mps <= self.town_mps <= self.fast_mps or self.moving_mps > self.fast_mps:
+            raise ValueError("speeds must rise from slow_mps over town_mps to fast_mps, with moving_mps not above")
+        return self
 
 
 class Config(_Section):

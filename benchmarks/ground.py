@@ -1,4 +1,6 @@
-"""Measure ground and drivable region on real scans: `python benchmarks/ground.py KITTI`, tables to standard output.
+"""Measure ground and drivable region: `python benchmarks/ground.py KITTI [STREETS]`, tables to standard output.
+
+STREETS is a folder that `augkitti synthesize` wrote; its truth is exact.
 
 Needs the `odometry/sequences/08` scan 001000 with its SemanticKITTI label file for all but the first table, and
 pypatchworkpp (a development dependency) for the comparison. Both run in this process, one thread, the best of five, in
@@ -34,9 +36,13 @@ def main() -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kitti", type=Path)
-    root = open_root(parser.parse_args().kitti)
+    parser.add_argument("streets", type=Path, nargs="?")
+    args = parser.parse_args()
+    root = open_root(args.kitti)
     plane_table(root)
     labelled_tables(root)
+    if args.streets:
+        street_table(open_root(args.streets))
 
 
 def plane_table(root: KittiRoot) -> None:
@@ -115,6 +121,30 @@ def labelled_tables(root: KittiRoot) -> None:
             f"| {reach} m | {road[here & inside].mean():.3f} | {inside[here & road].mean():.3f} "
             f"| {by_area[0] / by_area[1]:.3f} | {by_area[0] / by_area[2]:.3f} | {ms:.0f} |"
         )
+
+
+def street_table(root: KittiRoot) -> None:
+    """The region against the exact truth of procedural streets, within 40 m, and the heights of their road."""
+    profile = load_profile()
+    rows, heights = [], []
+    for sequence in root.sequences:
+        for frame in sequence.frames:
+            scan = read_scan(sequence, frame)
+            truth = np.load(sequence.folder / "truth" / f"{frame:010d}.npz")["ground"][scan.row]
+            ground = fit_ground(scan.xyz, CONFIG.ground)
+            region = find_drivable_region(scan, assign_rays(scan, profile), ground, CONFIG.drivable)
+            here = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) < 40.0
+            inside = here & is_drivable(region, scan.xyz[:, :2]) & (truth > 0)
+            road = here & (truth == 1)
+            rows.append([(inside & road).sum(), inside.sum(), road.sum()])
+            heights.append(np.median(np.abs(scan.xyz[road, 2] - height_at(ground, scan.xyz[road, :2]))))
+    hits, found, all_road = np.array(rows, dtype=np.float64).T
+    print("\n| streets | scans | precision | worst | recall | worst | road height, median cm |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print(
+        f"| {len(root.sequences)} | {len(rows)} | {hits.sum() / found.sum():.3f} | {(hits / found).min():.3f} "
+        f"| {hits.sum() / all_road.sum():.3f} | {(hits / all_road).min():.3f} | {100 * np.median(heights):.2f} |"
+    )
 
 
 def area(cell: np.ndarray, mask: np.ndarray) -> int:

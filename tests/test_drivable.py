@@ -10,6 +10,7 @@ from augkitti.ground import fit_ground
 from augkitti.kitti import open_root, read_scan
 from augkitti.scan_pair import Scan
 from augkitti.scanner import assign_rays, load_profile
+from augkitti.synthesize import ROAD, synthesize
 
 CONFIG = Config()
 PARKED = (12.0, -2.4, 4.2, 1.8, 0.0, 1.5)
@@ -100,6 +101,19 @@ def test_same_scan_gives_the_same_bytes(street, region):
     again = region_of(*street.scan())
     assert again.drivable.tobytes() == region.drivable.tobytes()
     assert again.road_heading_rad == region.road_heading_rad
+
+
+def test_region_on_the_embedded_street_holds_its_road_and_no_pavement(tmp_path):
+    profile = load_profile()
+    synthesize(tmp_path / "streets", 1, 1, 3, profile)
+    (sequence,) = open_root(tmp_path / "streets").sequences
+    scan = read_scan(sequence, sequence.frames[0])
+    (truth,) = sequence.folder.rglob("truth/*.npz")
+    ground = np.load(truth)["ground"][scan.row]
+    inside = is_drivable(region_of(scan, assign_rays(scan, profile)), scan.xyz[:, :2])
+    near = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) < 40.0
+    assert (ground[inside & near & (ground > 0)] == ROAD).mean() > 0.97
+    assert inside[near & (ground == ROAD)].mean() > 0.75
 
 
 @pytest.mark.kitti
