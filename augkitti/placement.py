@@ -44,7 +44,7 @@ from augkitti.vehicle_motion import Drive, bicycle_twist, draw_drive, drive_plan
 SEAM_RAD = np.deg2rad(15.0)  # contract: no car's azimuth span comes closer to straight behind
 _SEAM_MARGIN_RAD = np.deg2rad(0.5)
 _EGO_BOX = np.array([-0.45, 0.0, 0.0, 4.9, 1.9, 1.6, 0.0])  # KITTI's car round its scanner, seen from above
-_TALLEST_M = 4.0  # measured points higher above the ground touch no car
+_LOWEST_M, _TALLEST_M = 0.1, 4.0  # measured points lower or higher above the ground touch no car
 _TRACK_SHARE = 0.8  # wheels stand this far apart, in parts of the width (which has the mirrors in it)
 _STEEPEST = 0.2  # rise over run: cars stand on roads
 _ROAD_WINDOW_M = 7.0  # half of the window in which the region's long axis is the road
@@ -184,11 +184,9 @@ def _scene_scan(
     prepared: PreparedScan, middle_s: float, twist: F64, rolling: bool, labels: Sequence[LabelledBox]
 ) -> SceneScan:
     scan, rays, ground = prepared.scan, prepared.rays, prepared.ground
-    standing = np.flatnonzero(~ground.is_ground)
+    above = scan.xyz[:, 2] - height_at(ground, scan.xyz[:, :2])
+    standing = np.flatnonzero((above > _LOWEST_M) & (above < _TALLEST_M))
     xyz = scan.xyz[standing].astype(np.float64)
-    above = xyz[:, 2] - height_at(ground, xyz[:, :2])
-    use = (above > 0.0) & (above < _TALLEST_M)
-    standing, xyz = standing[use], xyz[use]
     fired = rays.ray_time_s[rays.ray[standing]] if rolling else np.zeros(len(standing))
     half = 0.5 * scan.period_s
     bin_of = np.clip(((fired + half) / scan.period_s * _POSE_BINS).astype(np.int64), 0, _POSE_BINS - 1)
@@ -197,9 +195,9 @@ def _scene_scan(
     return SceneScan(
         prepared=prepared,
         middle_s=middle_s,
-        xyz=xyz,
+        xyz=np.asfortranarray(xyz),  # searched by column
         time_s=middle_s + fired,
-        xyz_world=transform_points(T_world_then[bin_of], xyz),
+        xyz_world=np.asfortranarray(transform_points(T_world_then[bin_of], xyz)),
         farthest_m=_farthest(prepared),
         ring_elevation_rad=_ring_elevation(prepared),
         boxes=np.array([label.box for label in labels]).reshape(-1, 7),
@@ -319,8 +317,8 @@ def _moments(scene: PlacementScene, k: int, xy: F64) -> F64:
     """When (M,) seconds from scan k's middle its azimuth passes places (M, 2)."""
     if not scene.rolling:
         return np.zeros(len(xy))
-    period = scene.scans[k].prepared.scan.period_s
-    return np.array([azimuth_time(bearing, period) for bearing in np.arctan2(xy[:, 1], xy[:, 0])])
+    share = wrap_angle(np.arctan2(xy[:, 1], xy[:, 0])) / (2.0 * np.pi)  # `azimuth_time` of many
+    return np.asarray(-share * scene.scans[k].prepared.scan.period_s, dtype=np.float64)
 
 
 def _footprint_drivable(prepared: PreparedScan, model: CarModel, xy: F64, yaw: F64) -> Bool:

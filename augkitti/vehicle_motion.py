@@ -73,11 +73,13 @@ def drive_planar(xy: F64, yaw_rad: F64, elapsed_s: F64, drive: Drive, rear_axle_
 
 
 def _draw_speed(must_move: bool, config: MotionConfig, rng: np.random.Generator) -> float:
-    standing = 0.0 if must_move else config.standing_share
-    kind = _pick((standing, config.slow_share, config.town_share, config.fast_share), rng)
+    shares: tuple[float, ...] = (config.standing_share, config.slow_share, config.town_share, config.fast_share)
     edges = (0.0, 0.0, config.slow_mps, config.town_mps, config.fast_mps)
-    low = max(edges[kind], config.moving_mps) if must_move else edges[kind]
-    speed = float(rng.uniform(min(low, edges[kind + 1]), edges[kind + 1])) if kind else 0.0
+    least = config.moving_mps if must_move else 0.0
+    if must_move:  # no kind of speed that ends below
+        shares = (0.0, *(share if edges[k] >= least else 0.0 for k, share in enumerate(shares[1:], start=2)))
+    kind = _pick(shares, rng)
+    speed = float(rng.uniform(max(edges[kind], least), edges[kind + 1])) if kind else 0.0
     return -speed if rng.random() < config.reversing_share and kind == 1 else speed
 
 

@@ -1,10 +1,12 @@
 """How virtual cars drive: the bicycle, its limits, and the shares that drives are drawn with."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from augkitti.config import MotionConfig
+from augkitti.config import MotionConfig, load_config
+from augkitti.errors import InputError
 from augkitti.frames import pose_from_xyz_yaw, se3_exp, transform_points, yaw_of
 from augkitti.vehicle_motion import bicycle_twist, bicycle_yaw_rate, draw_drive, drive_planar, steering_limit
 
@@ -76,3 +78,17 @@ def test_only_standing_cars_where_only_those_are_wanted():
     rng = np.random.default_rng(0)
     assert all(draw_drive(2.7, False, config, rng).speed_mps == 0.0 for _ in range(50))
     assert all(abs(draw_drive(2.7, True, config, rng).speed_mps) >= config.moving_mps for _ in range(50))
+
+
+def test_the_least_speed_may_lie_above_slow_speeds():
+    config = MotionConfig(moving_mps=6.0)
+    rng = np.random.default_rng(0)
+    speeds = [abs(draw_drive(2.7, True, config, rng).speed_mps) for _ in range(300)]
+    assert min(speeds) >= 6.0
+    assert min(speeds) < 15.0
+
+
+@pytest.mark.parametrize("values", [{"slow_mps": 20.0}, {"fast_mps": 3.0}, {"moving_mps": 40.0}])
+def test_speeds_out_of_order_are_refused(values):
+    with pytest.raises(InputError, match="motion"):
+        load_config(None, motion=values)
