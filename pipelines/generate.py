@@ -20,13 +20,13 @@ from pipelines.shard_row import ShardRow, read_row
 from pipelines.stage import console
 from pipelines.streets import Streets, make_streets
 
-# Measured on shared real scans with real CAD models, one core; docs/figures.md, "Generation". For --dry-run only.
-BYTES_PER_PAIR = 4.4e6
-BYTES_PER_PREPARED_SCAN = 0.6e6
-BYTES_PER_STREET_SCAN = 1.9e6
-SECONDS_PER_PAIR = 1.0
-SECONDS_PER_PREPARED_SCAN = 0.5
-SECONDS_PER_STREET_SCAN = 1.0
+# Measured on real scans with real CAD models, seconds of one core; docs/figures.md, "Generation". For --dry-run only.
+BYTES_PER_PAIR = 3.3e6
+BYTES_PER_PREPARED_SCAN = 0.48e6
+BYTES_PER_STREET_SCAN = 2.0e6
+SECONDS_PER_PAIR = 0.7
+SECONDS_PER_PREPARED_SCAN = 0.35
+SECONDS_PER_STREET_SCAN = 0.4
 
 
 def generate(options: Options, jobs: int, resume: bool, dry_run: bool) -> int:
