@@ -26,6 +26,7 @@ _ASIDE_M = 80.0
 _KERB_FACE_M = 0.03
 _CORNER_RADIUS_M = 4.0
 _PATH_STEP_M = 0.05
+_STEERING_STEPS = 70  # 3.5 m, twice: about a second and a half at the speed of a turn
 _CLEAR_M = 0.25
 
 
@@ -270,14 +271,12 @@ def make_track(
     acceleration_mps2: float = 0.0,
 ) -> Track:
     """A track along straight legs between corners (C, 2) in (s, n), rounded by arcs of `radius_m`."""
-    sn = _rounded(np.asarray(corners_sn, dtype=np.float64), radius_m)
+    sn = _steered(_rounded(np.asarray(corners_sn, dtype=np.float64), radius_m))
     xyz = world_points(shape, sn[:, 0], sn[:, 1])
     along = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(xyz[:, :2], axis=0) ** 2).sum(axis=1)))])
     direction = np.gradient(xyz[:, :2], axis=0)
     direction /= np.maximum(np.sqrt((direction**2).sum(axis=1, keepdims=True)), 1e-12)
     yaw = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
-    smooth = np.ones(21) / 21.0  # arcs meet legs with a jump in curvature: a steering wheel turns over a metre
-    yaw = np.convolve(np.pad(yaw, 10, mode="reflect", reflect_type="odd"), smooth, mode="valid")
     leg = np.gradient(sn, axis=0)
     leg /= np.maximum(np.sqrt((leg**2).sum(axis=1, keepdims=True)), 1e-12)
     ahead = sn + wheelbase_m * leg
@@ -316,6 +315,16 @@ def track_poses(track: Track, time_s: Array) -> F64:
 
 def _height_at(shape: Shape, sn: F64) -> F64:
     return surface_height(shape, sn[:, 0], sn[:, 1])
+
+
+def _steered(path: F64) -> F64:
+    """A path (K, 2) whose curvature grows gradually: arcs meet legs with a jump, a steering wheel does not."""
+    half = min(_STEERING_STEPS // 2, len(path) - 1)
+    mean = np.ones(2 * half + 1) / (2 * half + 1)
+    for _ in range(2):
+        padded = np.pad(path, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
+        path = np.stack([np.convolve(padded[:, i], mean, mode="valid") for i in range(2)], axis=1)
+    return path
 
 
 def _rounded(corners: F64, radius_m: float) -> F64:

@@ -45,7 +45,7 @@ from augkitti.sensor_noise import CarLook, quantise_range, simulate_returns
 from augkitti.street import Body, Street, body_poses, build_street, scanner_poses
 from augkitti.street_objects import ASPHALT, GRASS, KERB, MARKING, PAVEMENT
 
-METHOD = "street 2"  # part of the digest: raise it when what is drawn or how it is scanned changes
+METHOD = "street 3"  # part of the digest: raise it when what is drawn or how it is scanned changes
 DATE = "2000_01_01"  # a day on which KITTI recorded nothing
 ROAD, SIDEWALK, LAND = 1, 2, 3
 
