@@ -50,7 +50,8 @@ _STEEPEST = 0.2  # rise over run: cars stand on roads
 _ROAD_WINDOW_M = 7.0  # half of the window in which the region's long axis is the road
 _ROAD_CELL_M = 0.8  # coarse is fine enough for an axis
 _EGO_ROAD_WEIGHT = 0.15  # of the ego road's axis, against 1 for a line and 0 for a square
-_LARGEST_BEND_RAD = 0.7  # beyond it is another street
+_LARGEST_BEND_RAD = 0.7  # beyond it is a side street, if the region is long there
+_LEAST_LONG = 0.3
 _AZIMUTH_BINS = 1440
 _POSE_BINS = 512  # firing times are this finely resolved where static points are put into the world
 _RETURNED = 0.7  # scanner.md section 3: share of body rays that return, mean over real cars
@@ -109,7 +110,7 @@ def make_scene(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan,
         raw=raw,
         cell_xy=cell_xy,
         cell_heading_rad=cell_heading,
-        cell_chance=_cell_chances(cell_xy, prepared0.region.road_heading_rad, config.placement),
+        cell_chance=_cell_chances(cell_xy, cell_heading, prepared0.region.road_heading_rad, config.placement),
         check_times_s=times,
         label_quads=_label_quads(pair, twist, times, rolling, config.placement.box_gap_m),
         ego_quads=_quads(compose(T_world_ego, _planar_pose(_EGO_BOX)), _EGO_BOX[3:5], config.placement.box_gap_m)[None],
@@ -231,10 +232,10 @@ def _drivable_cells(region: DrivableRegion, config: PlacementConfig) -> tuple[F6
 
 
 def _road_headings(region: DrivableRegion, cells: Array) -> F64:
-    """Heading (C,) of the road at cells: the long axis of the region round each, where it has one near the ego road's.
+    """Heading (C,) of the road at cells, within a right angle of the ego road's: the region's long axis round each.
 
     Second moments of the region in a window; an axis and its opposite are one, hence doubled angles. Where the window
-    has no long axis (squares, junctions) or a side street's, the ego road's own heading stands.
+    has no long axis (squares, junctions) the ego road's own heading stands.
     """
     step = max(1, round(_ROAD_CELL_M / region.cell_m))
     window = 2 * int(_ROAD_WINDOW_M / (step * region.cell_m)) + 1
@@ -255,18 +256,22 @@ def _road_headings(region: DrivableRegion, cells: Array) -> F64:
     cosine = (uu - vv) / spread + _EGO_ROAD_WEIGHT * np.cos(2.0 * ego)
     sine = 2.0 * uv / spread + _EGO_ROAD_WEIGHT * np.sin(2.0 * ego)
     bend = 0.5 * np.asarray(wrap_angle(np.arctan2(sine, cosine) - 2.0 * ego), dtype=np.float64)
-    return ego + np.where(np.abs(bend) < _LARGEST_BEND_RAD, bend, 0.0)
+    is_street = (np.abs(bend) < _LARGEST_BEND_RAD) | (np.hypot(uu - vv, 2.0 * uv) / spread > _LEAST_LONG)
+    return ego + np.where(is_street, bend, 0.0)
 
 
-def _cell_chances(xy: F64, road_heading_rad: float, config: PlacementConfig) -> dict[str, F64]:
-    """Cumulated weights: distances evenly over where there is room, fewer on the wrong side of the road."""
+def _cell_chances(xy: F64, heading_rad: F64, road_heading_rad: float, config: PlacementConfig) -> dict[str, F64]:
+    """Cumulated weights: distances evenly over where there is room, fewer on the wrong side and in side streets."""
     ring = np.floor(np.hypot(xy[:, 0], xy[:, 1]) / 2.0).astype(np.int64)
     even = 1.0 / np.maximum(np.bincount(ring), 25)[ring] if len(xy) else np.zeros(0)
+    on_ego_road = np.abs(heading_rad - road_heading_rad) < _LARGEST_BEND_RAD
     left = xy[:, 1] * np.cos(road_heading_rad) - xy[:, 0] * np.sin(road_heading_rad)
     anywhere = np.cumsum(even)
     return {
-        "along": np.cumsum(even * np.where(left < 1.75, 1.0, config.wrong_side_weight)),  # beyond is the other lane
-        "against": np.cumsum(even * np.where(left > 1.75, 1.0, config.wrong_side_weight)),
+        "along": np.cumsum(
+            even * np.where((left < 1.75) & on_ego_road, 1.0, config.wrong_side_weight)
+        ),  # beyond is the other lane
+        "against": np.cumsum(even * np.where((left > 1.75) & on_ego_road, 1.0, config.wrong_side_weight)),
         "turning": anywhere,
         "crossing": anywhere,
     }
@@ -283,7 +288,9 @@ def _likely_places(
         return np.zeros((0, 2)), np.zeros(0)
     cell = np.minimum(np.searchsorted(chance, picks * chance[-1]), len(chance) - 1)
     xy = scene.cell_xy[cell] + jitter * scene.scans[0].prepared.region.cell_m
-    yaw = scene.cell_heading_rad[cell] + drive.heading_rad
+    crossing = drive.course == "crossing"  # the ego road, not the side street that the car may stand in
+    road = scene.scans[0].prepared.region.road_heading_rad if crossing else scene.cell_heading_rad[cell]
+    yaw = np.full(len(xy), drive.heading_rad) + road
     if scene.raw:
         behind = np.abs(wrap_angle(np.arctan2(xy[:, 1], xy[:, 0]) - np.pi))
         xy, yaw = xy[behind > SEAM_RAD], yaw[behind > SEAM_RAD]
