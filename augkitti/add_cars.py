@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from augkitti.config import Config
-from augkitti.frames import F32, F64, compose, invert, points_in_box
+from augkitti.frames import F32, F64, compose, invert, points_in_box, rotate_vectors, transform_points
 from augkitti.labelled_objects import LabelledObjects, pair_interval
 from augkitti.movers import find_movers
-from augkitti.occlusion import Occluded, keep_nearest
+from augkitti.occlusion import Occluded, keep_nearest, measured_range
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
 from augkitti.placement import car_box
-from augkitti.raycast import CarHits, cast_car, rays_near
+from augkitti.raycast import CarHits, cast_car, cross_box, rays_near
 from augkitti.scan_pair import (
     I16,
     MEASURED,
@@ -29,6 +29,8 @@ from augkitti.scanner import ScannerProfile, ray_lines
 from augkitti.scene_flow import scene_flow
 from augkitti.sensor_noise import CarLook, CarReturns, simulate_returns
 
+_BODY_MIDDLE = (0.70, 0.25, 0.50)  # contract, invariant 8: share of length and width; of height from, to
+_OPEN_SHARE = 0.005  # half of what the contract allows: the sweep shears what is judged here in one moment
 _SHEAR_M = 0.24  # contract: 0.25 m; less the rounding of coordinates
 _NEAR_M = 0.3  # rays are tried this far round the car's box, beside what it moves within the sweep
 
@@ -106,6 +108,38 @@ def keeps_its_shape(
         )
         points = origin + returns.range_m[returns.returned, None] * direction
         if not points_in_box(points, pose, car.model.size_m, _SHEAR_M).all():
+            return False
+    return True
+
+
+def hides_what_is_behind(
+    car: VirtualCar, cast: Cast, scan0: PreparedScan, scan1: PreparedScan, profile: ScannerProfile
+) -> bool:
+    """Whether the middle of the car's body is closed to the rays, as real bodies are (contract, invariant 8).
+
+    A model with open wheel arches or no floor lets pulses through from some sides; the car is then put elsewhere.
+    """
+    share, low, high = _BODY_MIDDLE
+    size = car.model.size_m
+    lower = np.array([-share * size[0] / 2, -share * size[1] / 2, (low - 0.5) * size[2]])
+    upper = np.array([share * size[0] / 2, share * size[1] / 2, (high - 0.5) * size[2]])
+    for prepared, pose, hits, returns in zip(
+        (scan0, scan1), (car.pose0, car.pose1), cast.hits, cast.returns, strict=True
+    ):
+        rays = prepared.rays
+        near = rays_near(rays, pose, size, 0.0)
+        origin, direction = ray_lines(
+            profile, rays.ray_ring[near], rays.ray_azimuth_rad[near], rays.ray_elevation_rad[near]
+        )
+        T_car_velo = invert(pose)
+        enter, leave = cross_box(
+            transform_points(T_car_velo, origin), rotate_vectors(T_car_velo, direction), lower, upper
+        )
+        through = (enter < leave) & (enter > 0.0)
+        stopped = np.isin(near, hits.ray[np.isfinite(returns.stop_m)])
+        measured = measured_range(prepared, near, profile)
+        open_rays = through & ~stopped & np.isfinite(measured) & (measured > enter)
+        if open_rays.sum() > _OPEN_SHARE * through.sum():
             return False
     return True
 

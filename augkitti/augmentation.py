@@ -5,7 +5,14 @@ Read `augment_pair` first; each step is a file of its own.
 
 from collections.abc import Sequence
 
-from augkitti.add_cars import Cast, cast_and_measure, finish_pair, keeps_its_shape, seen_well_enough
+from augkitti.add_cars import (
+    Cast,
+    cast_and_measure,
+    finish_pair,
+    hides_what_is_behind,
+    keeps_its_shape,
+    seen_well_enough,
+)
 from augkitti.config import Config
 from augkitti.drivable import find_drivable_region
 from augkitti.ground import fit_ground
@@ -60,9 +67,11 @@ def augment_pair(
         if car is None:
             continue
         cast = cast_and_measure(car, pair, scan0, scan1, profile, config, generator(seed, "look", attempt))
-        if not keeps_its_shape(car, cast, scan0, scan1, profile):
-            continue
-        if seen_well_enough([*casts, cast], scan0, scan1, profile, config.min_points):
+        if (
+            keeps_its_shape(car, cast, scan0, scan1, profile)
+            and hides_what_is_behind(car, cast, scan0, scan1, profile)
+            and seen_well_enough([*casts, cast], scan0, scan1, profile, config.min_points)
+        ):
             cars.append(car)
             casts.append(cast)
     if len(cars) < fewest:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from augkitti.errors import InputError
 
@@ -162,6 +162,13 @@ class Config(_Section):
     movers: MoversConfig = Field(MoversConfig(), description="unlabelled moving things")
     placement: PlacementConfig = Field(PlacementConfig(), description="where cars are put")
     motion: MotionConfig = Field(MotionConfig(), description="how cars move")
+
+    @field_validator("cars")
+    @classmethod
+    def _from_is_at_most_to(cls, cars: tuple[int, int]) -> tuple[int, int]:
+        if not 0 <= cars[0] <= cars[1]:
+            raise ValueError(f"{cars[0]} to {cars[1]} is no range of cars; give two numbers such as 1, 3 or 0, 0")
+        return cars
 
     def digest(self) -> str:
         """sha256 over the sorted JSON of all values."""

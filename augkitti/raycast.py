@@ -148,11 +148,15 @@ def cast_mesh(model: CarModel, ray: I32, origin: F64, direction: F64, opaque_gla
     return CarHits(ray[met], ranges[met], faces[met], surface[met], cosines[met])
 
 
+def cross_box(origin: F64, direction: F64, lower: Array, upper: Array) -> tuple[F64, F64]:
+    """Where (metres along each ray) rays enter and leave a box between two corners (3,); entry after exit: a miss."""
+    slope = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    a, b = (lower - origin) / slope, (upper - origin) / slope
+    return np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+
+
 def _enter_box(origin: F64, direction: F64, size_m: Array) -> tuple[F64, Any]:
     """Where (metres along the ray) to start just before the model's box, and which rays meet the box at all."""
     half = np.asarray(size_m, dtype=np.float64) / 2.0 + 1e-3
-    slope = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-    a, b = (-half - origin) / slope, (half - origin) / slope
-    enter = np.minimum(a, b).max(axis=1)
-    leave = np.maximum(a, b).min(axis=1)
+    enter, leave = cross_box(origin, direction, -half, half)
     return np.maximum(enter - _START_BEFORE_M, 0.0), (leave >= np.maximum(enter, 0.0))

@@ -68,13 +68,24 @@ def on_streets(root, seed, frames, config, profile, verbose):
             if verbose:
                 for suspect in find_suspects(pair, scan0, scan1, config.movers):
                     if moves(suspect, config.movers) and moving[suspect.points].mean() < 0.5:
-                        print("  wrong:", f"{sequence.name}/{frame0}", len(suspect.points), suspect.visible, suspect.against,
-                              suspect.met, suspect.motion_m, f"{suspect.misfit_still_m:.2f} {suspect.misfit_moved_m:.2f}",
-                              pair.scan0.xyz[suspect.points].mean(axis=0).round(1),
-                              f"moving {moving[suspect.points].mean():.2f}")  # fmt: skip
-    print(f"recall {hit / max(1, wanted):.3f} over {wanted} points ({bodies_hit} of {bodies} bodies), "
-          f"precision {right / max(1, flagged):.3f} over {flagged} points, "
-          f"{1e3 * np.median(times):.0f} ms a pair (median of {len(times)}, one core, scans prepared)")  # fmt: skip
+                        print(
+                            "  wrong:",
+                            f"{sequence.name}/{frame0}",
+                            len(suspect.points),
+                            suspect.visible,
+                            suspect.against,
+                            suspect.met,
+                            suspect.motion_m,
+                            round(suspect.misfit_still_m, 2),
+                            round(suspect.misfit_moved_m, 2),
+                            pair.scan0.xyz[suspect.points].mean(axis=0).round(1),
+                            f"moving {moving[suspect.points].mean():.2f}",
+                        )
+    print(
+        f"recall {hit / max(1, wanted):.3f} over {wanted} points ({bodies_hit} of {bodies} bodies), "
+        f"precision {right / max(1, flagged):.3f} over {flagged} points, "
+        f"{1e3 * np.median(times):.0f} ms a pair (median of {len(times)}, one core, scans prepared)"
+    )
 
 
 def over_ground(pair, first, second):

@@ -17,11 +17,8 @@ from augkitti import kitti
 from augkitti.cad_models import load_cad_folder
 from augkitti.frames import box_pose, compose, invert, pose_from_xyz_yaw, rotate_vectors, transform_points
 from augkitti.occlusion import measured_range
-try:
-    from augkitti.parametric_cars import parametric_cars
-except ImportError:
-    parametric_cars = None
-from augkitti.raycast import cast_car, rays_near
+from augkitti.parametric_cars import parametric_cars
+from augkitti.raycast import cast_car, cross_box, rays_near
 from augkitti.scan_pair import PreparedScan
 from augkitti.scanner import assign_rays, load_profile, ray_lines
 from augkitti.sensor_noise import CarLook, simulate_returns
@@ -35,9 +32,7 @@ def crossing(origin, direction, size, zone):
     """Entry and exit (metres along each ray) of a zone given in shares of length, width and height above the floor."""
     low = np.array([zone[0][0] * size[0], zone[1][0] * size[1], (zone[2][0] - 0.5) * size[2]])
     high = np.array([zone[0][1] * size[0], zone[1][1] * size[1], (zone[2][1] - 0.5) * size[2]])
-    d = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-    a, b = (low - origin) / d, (high - origin) / d
-    return np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+    return cross_box(origin, direction, low, high)
 
 
 def shares(T_velo_box, size, rays, ray, measured):

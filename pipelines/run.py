@@ -381,8 +381,6 @@ def read_options(
         InputError: the configuration or the profile is bad, or a path does not exist.
     """
     loaded = load_config(config, **changes)
-    if not 0 <= loaded.cars[0] <= loaded.cars[1]:
-        raise InputError(config or "--cars", f"cars {loaded.cars[0]} to {loaded.cars[1]} is no range", "give 1-3 or 0")
     if seed < 0:
         raise InputError("--seed", f"is {seed}", "give a whole number from 0")
     if cad is not None and not cad.is_dir():
