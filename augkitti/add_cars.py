@@ -8,7 +8,6 @@ import numpy as np
 from augkitti.config import Config
 from augkitti.frames import F32, F64, compose, invert, points_in_box, rotate_vectors, transform_points
 from augkitti.labelled_objects import LabelledObjects, pair_interval
-from augkitti.movers import find_movers
 from augkitti.occlusion import Occluded, keep_nearest, measured_range
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
 from augkitti.placement import car_box
@@ -19,8 +18,8 @@ from augkitti.scan_pair import (
     NO_TICK,
     AugmentedPair,
     AugmentedScan,
-    Bool,
     ObjectRecord,
+    PreparedPair,
     PreparedScan,
     ScanPair,
     VirtualCar,
@@ -151,17 +150,16 @@ def occlude(casts: Sequence[Cast], k: int, prepared: PreparedScan, profile: Scan
 
 def finish_pair(
     pair: ScanPair,
-    scan0: PreparedScan,
-    scan1: PreparedScan,
+    prepared: PreparedPair,
     labelled: LabelledObjects,
     cars: Sequence[VirtualCar],
     casts: Sequence[Cast],
     profile: ScannerProfile,
-    config: Config,
     seed: int,
     pair_id: str,
 ) -> AugmentedPair:
     """Hide what the cars hide, label every point, and fill the contract's columns."""
+    scan0, scan1 = prepared.scan0, prepared.scan1
     occluded0, occluded1 = occlude(casts, 0, scan0, profile), occlude(casts, 1, scan1, profile)
     first_car = len(labelled.objects)
     columns0 = _columns(scan0, occluded0, labelled.instance0, first_car)
@@ -175,7 +173,7 @@ def finish_pair(
     counted = tuple(
         replace(item, points0=int(counts0[row]), points1=int(counts1[row])) for row, item in enumerate(objects)
     )
-    open_flow = labelled.unknown0 | (unlabelled_movers(pair, labelled, scan0, scan1, config) & (labelled.instance0 < 0))
+    open_flow = labelled.unknown0 | (prepared.movers0 & (labelled.instance0 < 0))
     unknown0 = np.concatenate([open_flow[occluded0.kept], np.zeros(len(occluded0.simulated.xyz), dtype=bool)])
     flow0, status0 = scene_flow(columns0, pair.ego_motion, counted, unknown0)
     return AugmentedPair(
@@ -198,19 +196,6 @@ def finish_pair(
         flow_status0=status0,
         objects=counted,
     )
-
-
-def unlabelled_movers(
-    pair: ScanPair, labelled: LabelledObjects, scan0: PreparedScan, scan1: PreparedScan, config: Config
-) -> Bool:
-    """Points (N0,) of scan 0 that contradict the ego-motion where the source's labels do not reach."""
-    if pair.label_coverage == "full":
-        return np.zeros(len(pair.scan0), dtype=bool)
-    movers = find_movers(pair, scan0, scan1, config.movers)
-    if pair.label_coverage == "camera" and pair.label_azimuth is not None:
-        azimuth = np.arctan2(pair.scan0.xyz[:, 1], pair.scan0.xyz[:, 0])
-        movers &= (azimuth < pair.label_azimuth[0]) | (azimuth > pair.label_azimuth[1])
-    return movers
 
 
 def _columns(prepared: PreparedScan, occluded: Occluded, instance: I16, first_car: int) -> AugmentedScan:

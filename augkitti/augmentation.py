@@ -17,8 +17,9 @@ from augkitti.config import Config
 from augkitti.drivable import find_drivable_region
 from augkitti.ground import fit_ground
 from augkitti.labelled_objects import label_points
+from augkitti.movers import unlabelled_movers
 from augkitti.placement import make_scene, propose_car
-from augkitti.scan_pair import AugmentedPair, CarModel, PreparedScan, Scan, ScanPair, VirtualCar
+from augkitti.scan_pair import AugmentedPair, CarModel, PreparedPair, PreparedScan, Scan, ScanPair, VirtualCar
 from augkitti.scanner import ScannerProfile, assign_rays
 from augkitti.seeds import generator
 
@@ -31,6 +32,11 @@ def prepare_scan(scan: Scan, profile: ScannerProfile, config: Config) -> Prepare
     return PreparedScan(scan, rays, ground, region)
 
 
+def prepare_pair(pair: ScanPair, scan0: PreparedScan, scan1: PreparedScan, config: Config) -> PreparedPair:
+    """All that depends on the source of a pair alone: both prepared scans, and what moves there without a label."""
+    return PreparedPair(scan0, scan1, unlabelled_movers(pair, scan0, scan1, config.movers))
+
+
 def augment_pair(
     pair: ScanPair,
     models: Sequence[CarModel],
@@ -38,7 +44,7 @@ def augment_pair(
     config: Config,
     seed: int,
     pair_id: str,
-    prepared: tuple[PreparedScan, PreparedScan] | None = None,
+    prepared: PreparedPair | None = None,
 ) -> AugmentedPair | None:
     """Put virtual cars into a pair (PointFlowNet section 4.1); None where fewer than `config.cars` found room.
 
@@ -49,9 +55,12 @@ def augment_pair(
         config: how many cars, where, how they move and how they are cast.
         seed: of this pair alone; the same seed gives the same bytes.
         pair_id: the contract's name of the pair.
-        prepared: both scans as `prepare_scan` gives them, if at hand.
+        prepared: the pair as `prepare_pair` gives it, if at hand.
     """
-    scan0, scan1 = prepared or (prepare_scan(pair.scan0, profile, config), prepare_scan(pair.scan1, profile, config))
+    prepared = prepared or prepare_pair(
+        pair, prepare_scan(pair.scan0, profile, config), prepare_scan(pair.scan1, profile, config), config
+    )
+    scan0, scan1 = prepared.scan0, prepared.scan1
     labelled = label_points(pair, scan0, scan1)
     scene = make_scene(pair, scan0, scan1, config)
     fewest, most = config.cars
@@ -76,4 +85,4 @@ def augment_pair(
             casts.append(cast)
     if len(cars) < fewest:
         return None
-    return finish_pair(pair, scan0, scan1, labelled, cars, casts, profile, config, seed, pair_id)
+    return finish_pair(pair, prepared, labelled, cars, casts, profile, seed, pair_id)

@@ -178,13 +178,17 @@ def scan_digest(sequence: Sequence, frame: int) -> str:
         InputError: as `read_scan` for the file and the timestamps.
     """
     path = sequence.scan_path(frame)
-    try:
-        content = path.read_bytes()
-    except OSError as err:
-        raise InputError(path, f"not readable ({err.strerror})", _FETCH) from err
     time_s, period_s = scan_time(sequence, frame)
     head = json.dumps([sequence.kind, time_s.hex(), period_s.hex()])
-    return hashlib.sha256(head.encode() + content).hexdigest()
+    try:
+        return _digest_of(path, _stat(path), head)
+    except OSError as err:
+        raise InputError(path, f"not readable ({err.strerror})", _FETCH) from err
+
+
+@lru_cache(maxsize=4096)
+def _digest_of(path: Path, stat: tuple[int, int], head: str) -> str:
+    return hashlib.sha256(head.encode() + path.read_bytes()).hexdigest()
 
 
 def scan_files(sequence: Sequence, frame: int) -> tuple[Path, ...]:

@@ -95,6 +95,17 @@ class _Both:
     tree_new1: cKDTree | None  # of these, in the ground plane
 
 
+def unlabelled_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig) -> Bool:
+    """Points (N0,) of scan 0 that contradict the ego-motion where the source's labels do not reach."""
+    if pair.label_coverage == "full":
+        return np.zeros(len(pair.scan0), dtype=bool)
+    movers = find_movers(pair, prepared0, prepared1, config)
+    if pair.label_coverage == "camera" and pair.label_azimuth is not None:
+        azimuth = np.arctan2(pair.scan0.xyz[:, 1], pair.scan0.xyz[:, 0])
+        movers &= (azimuth < pair.label_azimuth[0]) | (azimuth > pair.label_azimuth[1])
+    return movers
+
+
 def find_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: MoversConfig) -> Bool:
     """Which points (N0,) of scan 0 move against the static world.
 

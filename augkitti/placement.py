@@ -53,7 +53,6 @@ _EGO_ROAD_WEIGHT = 0.15  # of the ego road's axis, against 1 for a line and 0 fo
 _LARGEST_BEND_RAD = 0.7  # beyond it is a side street, if the region is long there
 _LEAST_LONG = 0.3
 _AZIMUTH_BINS = 1440
-_POSE_BINS = 512  # firing times are this finely resolved where static points are put into the world
 _RETURNED = 0.7  # scanner.md section 3: share of body rays that return, mean over real cars
 
 
@@ -65,7 +64,6 @@ class SceneScan:
     middle_s: float
     xyz: F64  # (M, 3) measured points that stand on the ground, velo at their own firing
     time_s: F64  # (M,)
-    xyz_world: F64  # (M, 3) as if nothing moved
     farthest_m: F64  # (rings, azimuth bins) measured range; infinite where a ray found nothing, 0 where it never can
     ring_elevation_rad: F64  # (rings,)
     boxes: F64  # (B, 7) labelled, in this scan
@@ -95,8 +93,8 @@ def make_scene(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan,
     interval = pair.scan1.time_s - pair.scan0.time_s
     twist = ego_twist(pair.ego_motion, interval)
     scans = (
-        _scene_scan(prepared0, 0.0, twist, rolling, pair.labels0),
-        _scene_scan(prepared1, interval, twist, rolling, pair.labels1),
+        _scene_scan(prepared0, 0.0, rolling, pair.labels0),
+        _scene_scan(prepared1, interval, rolling, pair.labels1),
     )
     half = 0.5 * pair.scan0.period_s if rolling else 0.0
     times = np.linspace(-half, interval + half, 9)
@@ -181,24 +179,17 @@ def clear_of_seam(scene: PlacementScene, car: VirtualCar) -> bool:
     return nearest > SEAM_RAD + _SEAM_MARGIN_RAD and not straddles
 
 
-def _scene_scan(
-    prepared: PreparedScan, middle_s: float, twist: F64, rolling: bool, labels: Sequence[LabelledBox]
-) -> SceneScan:
+def _scene_scan(prepared: PreparedScan, middle_s: float, rolling: bool, labels: Sequence[LabelledBox]) -> SceneScan:
     scan, rays, ground = prepared.scan, prepared.rays, prepared.ground
     above = scan.xyz[:, 2] - height_at(ground, scan.xyz[:, :2])
     standing = np.flatnonzero((above > _LOWEST_M) & (above < _TALLEST_M))
     xyz = scan.xyz[standing].astype(np.float64)
     fired = rays.ray_time_s[rays.ray[standing]] if rolling else np.zeros(len(standing))
-    half = 0.5 * scan.period_s
-    bin_of = np.clip(((fired + half) / scan.period_s * _POSE_BINS).astype(np.int64), 0, _POSE_BINS - 1)
-    centres = (np.arange(_POSE_BINS) + 0.5) / _POSE_BINS * scan.period_s - half if rolling else np.zeros(_POSE_BINS)
-    T_world_then = T_world_scanner(twist, middle_s + centres)
     return SceneScan(
         prepared=prepared,
         middle_s=middle_s,
         xyz=np.asfortranarray(xyz),  # searched by column
         time_s=middle_s + fired,
-        xyz_world=np.asfortranarray(transform_points(T_world_then[bin_of], xyz)),
         farthest_m=_farthest(prepared),
         ring_elevation_rad=_ring_elevation(prepared),
         boxes=np.array([label.box for label in labels]).reshape(-1, 7),
@@ -206,14 +197,16 @@ def _scene_scan(
 
 
 def _farthest(prepared: PreparedScan) -> F64:
-    rays = prepared.rays
-    xyz = prepared.scan.xyz.astype(np.float64)
-    measured = np.append(np.sqrt((xyz * xyz).sum(axis=1)), np.inf)  # index -1: nothing returned
-    reached = np.where(rays.ray_blind, 0.0, measured[rays.ray_point])
-    column = ((rays.ray_azimuth_rad + np.pi) / (2.0 * np.pi) * _AZIMUTH_BINS).astype(np.int64) % _AZIMUTH_BINS
-    farthest = np.zeros((int(rays.ray_ring.max(initial=0)) + 1, _AZIMUTH_BINS))
-    np.maximum.at(farthest, (rays.ray_ring, column), reached)
-    return farthest
+    rays, xyz = prepared.rays, prepared.scan.xyz
+    squared = xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1] + xyz[:, 2] * xyz[:, 2]
+    measured = np.append(np.sqrt(squared), np.float32(np.inf))  # index -1: nothing returned
+    reached = np.where(rays.ray_blind, np.float32(0.0), measured[rays.ray_point])
+    column = ((rays.ray_azimuth_rad + np.pi) * (_AZIMUTH_BINS / (2.0 * np.pi))).astype(np.int32) % _AZIMUTH_BINS
+    cell = rays.ray_ring.astype(np.int32) * _AZIMUTH_BINS + column
+    rings = int(rays.ray_ring.max(initial=0)) + 1
+    farthest = np.zeros(rings * _AZIMUTH_BINS, dtype=np.float32)
+    np.maximum.at(farthest, cell, reached)
+    return farthest.reshape(rings, _AZIMUTH_BINS).astype(np.float64)
 
 
 def _ring_elevation(prepared: PreparedScan) -> F64:
@@ -455,9 +448,13 @@ def _clear_of_points(scene: PlacementScene, scan: SceneScan, car: VirtualCar, k:
         return False
     times = np.linspace(car.moment0_s, scene.interval_s + car.moment1_s, 6)
     T_world = T_world_car(car, times)
-    middle = 0.5 * (T_world[0, :2, 3] + T_world[-1, :2, 3])
-    near = _within(scan.xyz_world, middle, reach + 0.5 * way + 0.5)
-    return not _any_in_car(transform_points(invert(T_world)[:, None], scan.xyz_world[near]), car.model, config)
+    middle = transform_points(
+        invert(T_world_scanner(scene.twist, scan.middle_s)), 0.5 * (T_world[0, :3, 3] + T_world[-1, :3, 3])
+    )
+    half_turn = 0.5 * scan.prepared.scan.period_s * float(np.abs(scene.twist[3:]).max()) * float(np.hypot(*middle[:2]))
+    near = _within(scan.xyz, middle, reach + 0.5 * way + 0.5 + 2.0 * ego_way + half_turn)
+    xyz_world = transform_points(T_world_scanner(scene.twist, scan.time_s[near]), scan.xyz[near])
+    return not _any_in_car(transform_points(invert(T_world)[:, None], xyz_world), car.model, config)
 
 
 def _within(xyz: F64, centre: F64, radius_m: float) -> Array:

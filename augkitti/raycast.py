@@ -86,10 +86,15 @@ def rays_near(rays: ScanRays, T_velo_car: F64, size_m: Array, grow_m: float) -> 
     low = np.arctan2(corners[:, 2].min() - 0.25, np.where(corners[:, 2].min() < 0.25, closest, distance.max()))
     high = np.arctan2(corners[:, 2].max() - 0.1, np.where(corners[:, 2].max() > 0.1, closest, distance.max()))
     margin = 0.03 / closest + 1e-3  # beams do not start at the frame's origin
-    bearing_off = wrap_angle(rays.ray_azimuth_rad - bearing)
-    inside = (bearing_off >= off.min() - margin) & (bearing_off <= off.max() + margin)
-    inside &= (rays.ray_elevation_rad >= low - margin) & (rays.ray_elevation_rad <= high + margin)
-    return np.flatnonzero(inside).astype(np.int32)
+    from_rad, to_rad = bearing + float(off.min()) - margin, bearing + float(off.max()) + margin
+    azimuth = rays.ray_azimuth_rad  # in [-pi, pi): a window over the cut behind is two
+    if from_rad < -np.pi or to_rad >= np.pi:
+        inside = (azimuth >= float(wrap_angle(from_rad))) | (azimuth <= float(wrap_angle(to_rad)))
+    else:
+        inside = (azimuth >= from_rad) & (azimuth <= to_rad)
+    beside = np.flatnonzero(inside)
+    elevation = rays.ray_elevation_rad[beside]
+    return np.asarray(beside[(elevation >= low - margin) & (elevation <= high + margin)], dtype=np.int32)
 
 
 def cast_car(

@@ -124,6 +124,15 @@ class ScanPair:
 
 
 @dataclass(frozen=True, eq=False)
+class PreparedPair:
+    """A pair with all that depends on the source alone: whatever cars go in, this stays."""
+
+    scan0: PreparedScan
+    scan1: PreparedScan
+    movers0: Bool  # (N0,) points of scan 0 that contradict the ego-motion where the source's labels do not reach
+
+
+@dataclass(frozen=True, eq=False)
 class CarModel:
     """A car's mesh in its own frame: x forward, y left, z up, metres, origin at the centre of its bounding box."""
 

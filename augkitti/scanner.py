@@ -64,6 +64,12 @@ class ScannerProfile:
         return 2.0 * np.pi / self.lattice_size
 
     @cached_property
+    def lattice_azimuth_rad(self) -> F64:
+        """Direction (beams, lattice_size) in which each beam looks at each tick, radians in [-pi, pi)."""
+        ring, tick = np.indices((self.beams, self.lattice_size))
+        return tick_azimuth(self, ring.astype(np.uint8), tick.astype(np.uint16))
+
+    @cached_property
     def digest(self) -> str:
         """sha256 of the profile's content."""
         return hashlib.sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()
@@ -169,19 +175,18 @@ def azimuth_time(azimuth_rad: float, period_s: float) -> float:
 
 def fire_rays(profile: ScannerProfile, fired_ticks: U16, period_s: float) -> ScanRays:
     """All rays of a revolution with the given fired ticks (F,) ascending, none returned yet: for scanning a scene."""
-    ring = np.repeat(np.arange(profile.beams, dtype=np.uint8), len(fired_ticks))
-    tick = np.tile(fired_ticks.astype(np.uint16), profile.beams)
+    fired = fired_ticks.astype(np.uint16)
     return ScanRays(
         ring=np.zeros(0, np.uint8),
         tick=np.zeros(0, np.uint16),
         ray=np.zeros(0, np.int32),
-        ray_ring=ring,
-        ray_tick=tick,
-        ray_azimuth_rad=tick_azimuth(profile, ring, tick),
-        ray_elevation_rad=profile.elevation_rad[ring],
-        ray_time_s=tick_time(profile, tick, period_s),
-        ray_point=np.full(len(ring), -1, np.int32),
-        ray_blind=profile.blind[ring, tick],
+        ray_ring=np.repeat(np.arange(profile.beams, dtype=np.uint8), len(fired)),
+        ray_tick=np.tile(fired, profile.beams),
+        ray_azimuth_rad=profile.lattice_azimuth_rad[:, fired].reshape(-1),
+        ray_elevation_rad=np.repeat(profile.elevation_rad, len(fired)),
+        ray_time_s=np.tile(tick_time(profile, fired, period_s), profile.beams),
+        ray_point=np.full(profile.beams * len(fired), -1, np.int32),
+        ray_blind=profile.blind[:, fired].reshape(-1),
     )
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from augkitti.augmentation import augment_pair
 from augkitti.dataset_index import shard_entry
 from augkitti.errors import InputError
-from augkitti.kitti import Sequence, read_pair
+from augkitti.kitti import Sequence
 from augkitti.scan_pair import MEASURED, AugmentedPair, PreparedScan
 from augkitti.shards import shard_metadata, write_shard
 from pipelines.plan import Candidate, ShardPlan, stream
-from pipelines.prepare import cached_ego_motion, prepared_scan
+from pipelines.prepare import prepared_pair
 from pipelines.run import Options, Run, skip_entry
 from pipelines.shard_row import ShardRow, read_row, write_row
 from pipelines.stage import run_tasks
@@ -111,12 +111,9 @@ def make_pair(
         InputError: a source of the pair is unreadable.
     """
     config, profile = options.config, options.scanner
-    models = options.models
-    scan0, scan1 = (prepared_scan(sequence, candidate.frame0 + k, profile, config, options.cache)[0] for k in (0, 1))
-    ego, _ = cached_ego_motion(sequence, candidate.frame0, options.cache, (scan0.scan, scan1.scan))
-    pair = read_pair(sequence, candidate.frame0, (scan0.scan, scan1.scan), ego)
-    augmented = augment_pair(pair, models, profile, config, candidate.seed, candidate.pair_id, (scan0, scan1))
-    return None if augmented is None else (augmented, (scan0, scan1))
+    pair, prepared, _ = prepared_pair(sequence, candidate.frame0, profile, config, options.cache)
+    augmented = augment_pair(pair, options.models, profile, config, candidate.seed, candidate.pair_id, prepared)
+    return None if augmented is None else (augmented, (prepared.scan0, prepared.scan1))
 
 
 def _count(pair: AugmentedPair, scans: tuple[PreparedScan, PreparedScan]) -> dict[str, int]:

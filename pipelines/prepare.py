@@ -2,9 +2,10 @@
 
 Reads: the planned pairs' `.bin` files, timestamps, OXTS, poses, calibration.
 Writes: `CACHE/prepared/<2 digits>/<digest>.npz`, one file a scan (rays, ground, drivable region) and one a pair
-(ego-motion). A file's name is the digest of all that its content depends on: the scan's bytes and times, the sections
-of the configuration that matter, the scanner profile, the program. So neighbouring pairs, other seeds and other cars
-find what is there, and nothing stale is ever read. Pickle is never loaded; a damaged file is made again.
+(ego-motion, unlabelled movers). A file's name is the digest of all that its content depends on: the scan's bytes and
+times, the sections of the configuration that matter, the scanner profile, the program. So neighbouring pairs, other
+seeds and other cars find what is there, and nothing stale is ever read. Pickle is never loaded; a damaged file is made
+again.
 """
 
 import hashlib
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from augkitti.augmentation import prepare_scan
+from augkitti.augmentation import prepare_pair, prepare_scan
 from augkitti.config import Config
 from augkitti.dataset_index import replace_whole
 from augkitti.ego_motion import EgoMotion
@@ -28,11 +29,13 @@ from augkitti.frames import F64, is_rigid
 from augkitti.kitti import (
     Sequence,
     ego_motion_digest,
+    label_reach,
     read_ego_motion,
+    read_pair,
     read_scan,
     scan_digest,
 )
-from augkitti.scan_pair import NO_TICK, DrivableRegion, GroundMap, PreparedScan, Scan, ScanRays
+from augkitti.scan_pair import NO_TICK, DrivableRegion, GroundMap, PreparedPair, PreparedScan, Scan, ScanPair, ScanRays
 from augkitti.scanner import ScannerProfile, fire_rays
 from pipelines.stage import run_tasks
 
@@ -54,7 +57,7 @@ def prepare_all(
         sequences: by name.
         frames: first frames of the planned pairs, by sequence name.
         profile: the scanner.
-        config: its `ground` and `drivable` sections matter.
+        config: its `ground`, `drivable` and `movers` sections matter.
         cache_folder: where to keep results.
         jobs: processes.
         stop: let the first unreadable scan end the run; else `augment` meets it again, leaves it out and lists it.
@@ -65,7 +68,7 @@ def prepare_all(
     made = kept = 0
     scans = [(sequences[s], f) for s in sorted(frames) for f in sorted({*frames[s], *(f + 1 for f in frames[s])})]
     pairs = [(sequences[s], f) for s in sorted(frames) for f in frames[s]]
-    for work, items, what in ((_scan_task, scans, "scans"), (_pair_task, pairs, "ego-motions")):
+    for work, items, what in ((_scan_task, scans, "scans"), (_pair_task, pairs, "pairs")):
         task = partial(work, profile=profile, config=config, cache_folder=cache_folder, stop=stop)
         for new in run_tasks(task, items, jobs, what, weight=lambda item: 1):
             made, kept = made + new, kept + (not new)
@@ -86,9 +89,8 @@ def _scan_task(
 def _pair_task(
     item: tuple[Sequence, int], profile: ScannerProfile, config: Config, cache_folder: Path, stop: bool
 ) -> bool:
-    sequence, frame0 = item
     try:
-        return cached_ego_motion(sequence, frame0, cache_folder)[1]
+        return prepared_pair(*item, profile, config, cache_folder)[2]
     except InputError:
         if stop:
             raise
@@ -103,7 +105,7 @@ def prepared_scan(
     Raises:
         InputError: the scan is unreadable.
     """
-    sections = {"ground": config.ground.model_dump(mode="json"), "drivable": config.drivable.model_dump(mode="json")}
+    sections = _sections(config, "ground", "drivable")
     path = _cache_path(cache_folder, ["scan", scan_digest(sequence, frame), sections, profile.digest])
     scan = read_scan(sequence, frame)
     content = _load(path)
@@ -117,25 +119,37 @@ def prepared_scan(
     return prepared, True
 
 
-def cached_ego_motion(
-    sequence: Sequence, frame0: int, cache_folder: Path, scans: tuple[Scan, Scan] | None = None
-) -> tuple[EgoMotion, bool]:
-    """A pair's ego-motion from the cache, or found and put there; and whether it was found now.
+def prepared_pair(
+    sequence: Sequence, frame0: int, profile: ScannerProfile, config: Config, cache_folder: Path
+) -> tuple[ScanPair, PreparedPair, bool]:
+    """A pair and what depends on its source alone, from the cache, or made and put there; and whether it was made.
 
     Raises:
         InputError: a scan or a file of the drive is unreadable.
     """
-    path = _cache_path(cache_folder, ["ego-motion", ego_motion_digest(sequence, frame0)])
+    scan0, scan1 = (prepared_scan(sequence, frame0 + k, profile, config, cache_folder)[0] for k in (0, 1))
+    scans = (scan0.scan, scan1.scan)
+    coverage, azimuth = label_reach(sequence)
+    parts = [ego_motion_digest(sequence, frame0), coverage, azimuth, _sections(config, "ground", "drivable", "movers")]
+    path = _cache_path(cache_folder, ["pair", *parts, profile.digest])
     content = _load(path)
     if content is not None:
-        T = content.get("T_velo1_velo0")
-        source = str(content.get("source"))
+        T, source, bits = content.get("T_velo1_velo0"), str(content.get("source")), content.get("movers0")
         if T is not None and source in ("oxts", "poses", "registration", "truth") and is_rigid(T, 1e-9):
-            return EgoMotion(T, source), False  # type: ignore[arg-type]
-    scan0, scan1 = scans or (read_scan(sequence, frame0), read_scan(sequence, frame0 + 1))
-    motion = read_ego_motion(sequence, frame0, scan0, scan1)
-    _store(path, {"T_velo1_velo0": motion.T_velo1_velo0, "source": np.array(motion.source)})
-    return motion, True
+            pair = read_pair(sequence, frame0, scans, EgoMotion(T, source))  # type: ignore[arg-type]
+            try:
+                return pair, PreparedPair(scan0, scan1, _bits(bits, (len(scan0.scan),))), False
+            except (TypeError, ValueError):
+                pass  # damaged or foreign: made again below
+    pair = read_pair(sequence, frame0, scans, read_ego_motion(sequence, frame0, *scans))
+    prepared = prepare_pair(pair, scan0, scan1, config)
+    content = {"T_velo1_velo0": pair.ego_motion, "source": np.array(pair.ego_source)}
+    _store(path, content | {"movers0": np.packbits(prepared.movers0)})
+    return pair, prepared, True
+
+
+def _sections(config: Config, *names: str) -> dict[str, Any]:
+    return {name: getattr(config, name).model_dump(mode="json") for name in names}
 
 
 @cache
@@ -165,7 +179,12 @@ def _load(path: Path) -> dict[str, Any] | None:
 
 def _store(path: Path, arrays: dict[str, Any]) -> None:
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, key=np.array(path.stem), **arrays)
+    np.savez(
+        buffer,
+        allow_pickle=False,  # not compressed: read for every pair, and a third of the scan's own size
+        key=np.array(path.stem),
+        **arrays,
+    )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         replace_whole(path, lambda file: file.write(buffer.getvalue()))

@@ -10,12 +10,12 @@ from tiny_drive import GROUND_Z_M, write_drive
 import augkitti
 from augkitti import kitti
 from augkitti.add_cars import cast_and_measure, keeps_its_shape
-from augkitti.augmentation import prepare_scan
+from augkitti.augmentation import prepare_pair, prepare_scan
 from augkitti.config import Config
 from augkitti.frames import compose, invert, pose_from_xyz_yaw, transform_points
 from augkitti.pair_motion import T_world_scanner, ego_twist
 from augkitti.parametric_cars import parametric_cars
-from augkitti.scan_pair import AugmentedPair, PreparedScan, ScanPair, VirtualCar
+from augkitti.scan_pair import AugmentedPair, PreparedPair, ScanPair, VirtualCar
 from augkitti.scanner import azimuth_time, load_profile
 
 PROFILE = load_profile()
@@ -23,11 +23,12 @@ MODELS = tuple(model for model in parametric_cars() if model.category == "Car")
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> tuple[ScanPair, tuple[PreparedScan, PreparedScan]]:
+def source(tmp_path_factory: pytest.TempPathFactory) -> tuple[ScanPair, PreparedPair]:
     drive = write_drive(tmp_path_factory.mktemp("drive"), frames=(0, 1))
     (sequence,) = kitti.open_root(drive.root).sequences
     pair = kitti.read_pair(sequence, 0)
-    return pair, (prepare_scan(pair.scan0, PROFILE, Config()), prepare_scan(pair.scan1, PROFILE, Config()))
+    scan0, scan1 = (prepare_scan(scan, PROFILE, Config()) for scan in (pair.scan0, pair.scan1))
+    return pair, prepare_pair(pair, scan0, scan1, Config())
 
 
 def augmented(source, seed: int = 5, **settings) -> AugmentedPair:
@@ -115,7 +116,8 @@ def test_snapshot_shutter_has_all_cars_at_the_middle_of_the_scan(source) -> None
 
 def test_pair_without_room_gives_nothing(source) -> None:
     pair, prepared = source
-    blocked = tuple(replace(p, region=replace(p.region, drivable=np.zeros_like(p.region.drivable))) for p in prepared)
+    region = replace(prepared.scan0.region, drivable=np.zeros_like(prepared.scan0.region.drivable))
+    blocked = replace(prepared, scan0=replace(prepared.scan0, region=region))
     assert augkitti.augment_pair(pair, MODELS, PROFILE, Config(), 5, "tiny/0/0", blocked) is None
 
 
@@ -132,7 +134,8 @@ def test_compensated_scans_are_cast_as_a_snapshot_without_ticks(kitti_root: Path
 
 @pytest.mark.parametrize(("speed_mps", "keeps"), [(34.0, False), (8.0, True)])
 def test_car_that_the_sweep_would_shear_out_of_its_box_is_told(source, speed_mps: float, keeps: bool) -> None:
-    pair, (scan0, _) = source
+    pair, prepared = source
+    scan0 = prepared.scan0
     model = MODELS[0]
     twist_ego = ego_twist(pair.ego_motion, pair.scan1.time_s - pair.scan0.time_s)
     pose0 = pose_from_xyz_yaw(0.0, 3.0, GROUND_Z_M + model.size_m[2] / 2, 0.0)

@@ -224,7 +224,7 @@ def test_cars_keep_away_from_straight_behind(street):
     interval = pair.scan1.time_s - pair.scan0.time_s
     twist = ego_twist(pair.ego_motion, interval)
     seen_behind = 0
-    for car in proposals(scene, 60):
+    for car in proposals(scene, 150):
         times = np.linspace(car.moment0_s, interval + car.moment1_s, 21)
         T_scanner_car = compose(invert(T_world_scanner(twist, times)), T_world_car(car, times))
         for T in T_scanner_car:
