@@ -4,6 +4,7 @@ A row is a pair and a row group is a row, so any pair is one seek away. `python 
 page of the documentation.
 """
 
+import errno
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -174,8 +175,21 @@ def replace_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        _sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a folder's names to the disk: a rename outlives a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    except OSError as err:
+        if err.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # file systems that know no such thing
+            raise
+    finally:
+        os.close(descriptor)
 
 
 def to_table(pair: AugmentedPair, schema: pa.Schema = SCHEMA) -> pa.Table:

@@ -7,23 +7,27 @@ shard whose row and file match the plan is kept. A shard depends on configuratio
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import chain
+from pathlib import Path
 
 import numpy as np
 
 from augkitti.augmentation import augment_pair
 from augkitti.dataset_index import shard_entry
-from augkitti.errors import InputError
+from augkitti.errors import InputError, MachineError
 from augkitti.kitti import Sequence
 from augkitti.scan_pair import MEASURED, AugmentedPair, PreparedScan
 from augkitti.shards import shard_metadata, write_shard
+from pipelines.cache import trim
 from pipelines.plan import Candidate, ShardPlan, stream
 from pipelines.prepare import prepared_pair
 from pipelines.run import Options, Run, skip_entry
 from pipelines.shard_row import ShardRow, read_row, write_row
 from pipelines.stage import run_tasks
 
+TRIM_EVERY = 100  # shards between two looks at the size of the cache
 NO_ROOM = "no virtual car found room"
 
 
@@ -32,10 +36,16 @@ def augment_all(run: Run, jobs: int) -> list[ShardRow]:
 
     Raises:
         InputError: a source is unreadable and the run is to stop there.
+        MachineError: the output or the cache cannot be written, or a worker died.
     """
     items = [(shard, run.sequences[shard.sequence]) for shard in run.shards]
     task = partial(augment_shard, options=run.options)
-    rows = list(run_tasks(task, items, jobs, "pairs", weight=lambda item: item[0].quota))
+    rows = []
+    for row in run_tasks(task, items, jobs, "pairs", weight=lambda item: item[0].quota):
+        rows.append(row)
+        if len(rows) % TRIM_EVERY == 0:
+            trim(run.options.cache)
+    trim(run.options.cache)
     return sorted(rows, key=lambda row: row.shard.name)
 
 
@@ -43,7 +53,8 @@ def augment_shard(item: tuple[ShardPlan, Sequence], options: Options) -> ShardRo
     """Make one shard, unless it is there.
 
     Raises:
-        InputError: a source is unreadable and the run is to stop there; or the output cannot be written.
+        InputError: a source is unreadable and the run is to stop there.
+        MachineError: the output or the cache cannot be written, or memory is short.
     """
     shard, sequence = item
     done = read_row(options.work, options.out, shard)
@@ -53,6 +64,7 @@ def augment_shard(item: tuple[ShardPlan, Sequence], options: Options) -> ShardRo
     skipped: Counter[tuple[str, str]] = Counter()
     path = options.out / "data" / f"{shard.name}.parquet"
     try:
+        options.work.stat()  # gone with the output folder: nothing is made in its place
         if path.exists():  # of a run that was cut off before it wrote the row
             path.unlink()
         pairs = _pairs(shard, sequence, options, totals, skipped)
@@ -70,8 +82,23 @@ def augment_shard(item: tuple[ShardPlan, Sequence], options: Options) -> ShardRo
         )
         write_row(options.work, row)
     except OSError as err:
-        raise InputError(path, f"cannot be written ({err.strerror})", "make room, then go on with --resume") from err
+        if not options.work.is_dir():
+            _take_back(path, options)
+            problem = "the output folder was removed under the run"
+            raise MachineError(options.out, problem, "start it again, with --resume") from err
+        problem = f"cannot be written ({err.strerror or err})"
+        raise MachineError(path, problem, "make room, then go on with --resume") from err
+    except MemoryError as err:
+        raise MachineError(path, "memory ran out", "use fewer --jobs, then go on with --resume") from err
     return row
+
+
+def _take_back(path: Path, options: Options) -> None:
+    """Remove what was written after the output folder had gone: a folder without a work folder is nobody's run."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+        path.parent.rmdir()
+        options.out.rmdir()
 
 
 def _pairs(

@@ -1,27 +1,33 @@
 """The `augkitti` command: arguments in, one library call, an exit code out.
 
-0: done; 1: fewer pairs than asked for, or a check found something; 2: bad input, one line on stderr; 130: interrupted.
+0: done; 1: fewer pairs than asked for, or a check found something; 2: bad input; 3: the machine gave way (disk, memory,
+a worker); 130: interrupted (SIGINT); 143: ended (SIGTERM). From 2 on: one line on stderr.
 Heavy imports stand inside the commands, so that `augkitti --help` answers at once.
 """
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from augkitti.errors import InputError
+from augkitti.errors import InputError, MachineError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 config_app = typer.Typer(no_args_is_help=True, help="Every setting of generation.")
 cad_app = typer.Typer(no_args_is_help=True, help="Car models.")
 data_app = typer.Typer(no_args_is_help=True, help="KITTI on disk.")
+cache_app = typer.Typer(no_args_is_help=True, help="What runs keep for the next one.")
 app.add_typer(config_app, name="config")
 app.add_typer(cad_app, name="cad")
 app.add_typer(data_app, name="data")
+app.add_typer(cache_app, name="cache")
 
 DEFAULT_OUT = Path("augkitti-data")
 
@@ -52,20 +58,47 @@ Resume = Annotated[bool, typer.Option("--resume", help="Go on with an unfinished
 
 @contextmanager
 def _answers() -> Iterator[None]:
-    """Bad input: one line on stderr, exit code 2. Interrupted: 130."""
+    """Bad input: one line on stderr, exit code 2. The machine gave way: 3. Interrupted: 130. Told to end: 143."""
     for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR"):  # read when numpy is imported, below
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # processes share the work, not threads
+    before = _on_sigterm(_terminated)
     try:
         yield
     except InputError as err:
         print(f"augkitti: {err}", file=sys.stderr)
         raise typer.Exit(2) from None
+    except MachineError as err:
+        print(f"augkitti: {err}", file=sys.stderr)
+        raise typer.Exit(3) from None
+    except _Terminated:
+        print("augkitti: told to end; finished shards are kept, go on with --resume", file=sys.stderr)
+        raise typer.Exit(143) from None
+    except BrokenProcessPool:
+        print("augkitti: a worker process was killed; use fewer --jobs, memory may be short", file=sys.stderr)
+        raise typer.Exit(3) from None
     except KeyboardInterrupt:
         print("augkitti: interrupted; finished shards are kept, go on with --resume", file=sys.stderr)
         raise typer.Exit(130) from None
     except BrokenPipeError:  # `augkitti ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(0) from None
+    finally:
+        _on_sigterm(before)
+
+
+class _Terminated(BaseException):
+    """SIGTERM came."""
+
+
+def _terminated(number: int, frame: Any) -> None:
+    raise _Terminated
+
+
+def _on_sigterm(answer: Any) -> Any:
+    """Set what answers SIGTERM; what did before. Only the main thread may."""
+    if threading.current_thread() is threading.main_thread():
+        return signal.signal(signal.SIGTERM, answer)
+    return None
 
 
 @app.command()
@@ -254,6 +287,25 @@ def data_status(kitti: Kitti = None) -> None:
         from pipelines.inspect_set import show_data_status
 
         raise typer.Exit(show_data_status(kitti))
+
+
+@cache_app.command("info")
+def cache_info() -> None:
+    """Print where the cache is, what it keeps, and how large it may become ($AUGKITTI_CACHE_GB)."""
+    with _answers():
+        from pipelines.cache import show_cache
+
+        show_cache()
+
+
+@cache_app.command("clear")
+def cache_clear() -> None:
+    """Remove all that the cache keeps; the next run makes it again."""
+    with _answers():
+        from pipelines.cache import cache_folder, clear
+
+        count, size = clear(cache_folder())
+        print(f"{count:,} entries removed, {size / 1e9:,.2f} GB")
 
 
 def _cars(text: str | None) -> tuple[int, int] | None:

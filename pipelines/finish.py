@@ -16,7 +16,7 @@ from augkitti.dataset_index import (
     write_card,
     write_index,
 )
-from augkitti.errors import InputError
+from augkitti.errors import MachineError
 from pipelines.run import Run, end_work
 from pipelines.shard_row import ShardRow
 
@@ -25,7 +25,7 @@ def finish_set(run: Run, rows: Sequence[ShardRow]) -> None:
     """Write the index and the card of a run whose shards are all done.
 
     Raises:
-        InputError: the disk refuses.
+        MachineError: the disk refuses.
     """
     options = run.options
     entries = [row.entry for row in rows if row.entry is not None]
@@ -54,5 +54,6 @@ def finish_set(run: Run, rows: Sequence[ShardRow]) -> None:
         write_card(options.out, index)
         write_index(options.out, index)
     except OSError as err:
-        raise InputError(options.out, f"cannot be written ({err.strerror})", "make room, then use --resume") from err
+        problem = f"cannot be written ({err.strerror})"
+        raise MachineError(options.out, problem, "make room, then go on with --resume") from err
     end_work(options.out)

@@ -6,6 +6,8 @@ Each stage can be run alone: `augkitti prepare`, `augment`, `finish`; they hand 
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.table import Table
@@ -13,9 +15,10 @@ from rich.table import Table
 from augkitti.errors import InputError
 from pipelines.augment import augment_all
 from pipelines.finish import finish_set
+from pipelines.lock import hold
 from pipelines.plan import ShardPlan
 from pipelines.prepare import prepare_all
-from pipelines.run import Options, Run, check_output, is_finished, open_run, reopen_run, start_work
+from pipelines.run import WORK, Options, Run, check_output, check_work, is_finished, open_run, reopen_run, start_work
 from pipelines.shard_row import ShardRow, read_row
 from pipelines.stage import console
 from pipelines.streets import Streets, make_streets
@@ -37,6 +40,7 @@ def generate(options: Options, jobs: int, resume: bool, dry_run: bool) -> int:
 
     Raises:
         InputError: bad input; before any work, except for sources that turn out unreadable with `--on-error stop`.
+        MachineError: the disk, the memory or a worker gave way; `resume` goes on from there.
     """
     if dry_run:
         return show_plan(options, jobs)
@@ -45,9 +49,10 @@ def generate(options: Options, jobs: int, resume: bool, dry_run: bool) -> int:
     if resume and is_finished(run):
         print(f"{options.out} is finished and whole: nothing to do")
         return 0
-    _prepare(run, jobs, resume)
-    rows = augment_all(run, jobs)
-    return _close(run, rows, time.monotonic() - started)
+    with hold(options.work):
+        _prepare(run, jobs, resume)
+        rows = augment_all(run, jobs)
+        return _close(run, rows, time.monotonic() - started)
 
 
 def prepare_stage(options: Options, jobs: int, resume: bool) -> None:
@@ -57,7 +62,8 @@ def prepare_stage(options: Options, jobs: int, resume: bool) -> None:
         InputError: as `generate`.
     """
     run = _begin(options, jobs, resume)
-    _prepare(run, jobs, resume)
+    with hold(options.work):
+        _prepare(run, jobs, resume)
 
 
 def _begin(options: Options, jobs: int, resume: bool) -> Run:
@@ -94,7 +100,8 @@ def augment_stage(out: Path, jobs: int) -> None:
     Raises:
         InputError: there is no plan, or a source is unreadable and the run is to stop there.
     """
-    augment_all(reopen_run(out), jobs)
+    with _reopened(out) as run:
+        augment_all(run, jobs)
 
 
 def finish_stage(out: Path) -> int:
@@ -103,14 +110,22 @@ def finish_stage(out: Path) -> int:
     Raises:
         InputError: there is no plan, or a shard is unfinished.
     """
-    run = reopen_run(out)
-    rows = [read_row(run.options.work, out, shard) for shard in run.shards]
-    there = [row for row in rows if row is not None]
-    if len(there) < len(rows):
-        raise InputError(
-            out, f"{len(rows) - len(there)} of {len(rows)} shards are unfinished", "run `augkitti augment`"
-        )
-    return _close(run, there, None)
+    with _reopened(out) as run:
+        rows = [read_row(run.options.work, out, shard) for shard in run.shards]
+        there = [row for row in rows if row is not None]
+        if len(there) < len(rows):
+            raise InputError(
+                out, f"{len(rows) - len(there)} of {len(rows)} shards are unfinished", "run `augkitti augment`"
+            )
+        return _close(run, there, None)
+
+
+@contextmanager
+def _reopened(out: Path) -> Iterator[Run]:
+    """The unfinished run in a folder, held."""
+    check_work(out)
+    with hold(out / WORK):
+        yield reopen_run(out)
 
 
 def _close(run: Run, rows: list[ShardRow], seconds: float | None) -> int:

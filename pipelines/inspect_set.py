@@ -15,7 +15,8 @@ from augkitti.dataset_index import DatasetIndex
 from augkitti.dataset_info import Motions
 from augkitti.errors import InputError
 from augkitti.scanner import ScannerProfile
-from pipelines.run import cache_folder, config_of
+from pipelines.cache import cache_folder
+from pipelines.run import config_of
 from pipelines.stage import console
 from pipelines.streets import make_streets, streets_of
 

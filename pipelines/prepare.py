@@ -8,13 +8,7 @@ seeds and other cars find what is there, and nothing stale is ever read. Pickle 
 again.
 """
 
-import hashlib
-import io
-import json
-import zipfile
-import zlib
-from functools import cache, partial
-from importlib import resources
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +16,6 @@ import numpy as np
 
 from augkitti.augmentation import prepare_pair, prepare_scan
 from augkitti.config import Config
-from augkitti.dataset_index import replace_whole
 from augkitti.ego_motion import EgoMotion
 from augkitti.errors import InputError
 from augkitti.frames import F64, is_rigid
@@ -37,9 +30,10 @@ from augkitti.kitti import (
 )
 from augkitti.scan_pair import NO_TICK, DrivableRegion, GroundMap, PreparedPair, PreparedScan, Scan, ScanPair, ScanRays
 from augkitti.scanner import ScannerProfile, fire_rays
+from pipelines.cache import entry_path, load, store, trim
 from pipelines.stage import run_tasks
 
-_FORMAT = "prepared 1"
+TRIM_EVERY = 4_000  # files made between two looks at the size of the cache
 
 
 def prepare_all(
@@ -64,6 +58,9 @@ def prepare_all(
 
     Returns:
         How many files were made and how many were there already.
+
+    Raises:
+        MachineError: the cache cannot be written, or a worker died.
     """
     made = kept = 0
     scans = [(sequences[s], f) for s in sorted(frames) for f in sorted({*frames[s], *(f + 1 for f in frames[s])})]
@@ -72,6 +69,9 @@ def prepare_all(
         task = partial(work, profile=profile, config=config, cache_folder=cache_folder, stop=stop)
         for new in run_tasks(task, items, jobs, what, weight=lambda item: 1):
             made, kept = made + new, kept + (not new)
+            if new and made % TRIM_EVERY == 0:
+                trim(cache_folder)
+    trim(cache_folder)
     return made, kept
 
 
@@ -106,16 +106,16 @@ def prepared_scan(
         InputError: the scan is unreadable.
     """
     sections = _sections(config, "ground", "drivable")
-    path = _cache_path(cache_folder, ["scan", scan_digest(sequence, frame), sections, profile.digest])
+    path = entry_path(cache_folder, ["scan", scan_digest(sequence, frame), sections, profile.digest])
     scan = read_scan(sequence, frame)
-    content = _load(path)
+    content = load(path)
     if content is not None:
         try:
             return _unpack(content, scan, profile), False
         except (KeyError, ValueError, IndexError, TypeError):
             pass  # damaged or foreign: made again below
     prepared = prepare_scan(scan, profile, config)
-    _store(path, _pack(prepared))
+    store(path, _pack(prepared))
     return prepared, True
 
 
@@ -131,8 +131,8 @@ def prepared_pair(
     scans = (scan0.scan, scan1.scan)
     coverage, azimuth = label_reach(sequence)
     parts = [ego_motion_digest(sequence, frame0), coverage, azimuth, _sections(config, "ground", "drivable", "movers")]
-    path = _cache_path(cache_folder, ["pair", *parts, profile.digest])
-    content = _load(path)
+    path = entry_path(cache_folder, ["pair", *parts, profile.digest])
+    content = load(path)
     if content is not None:
         T, source, bits = content.get("T_velo1_velo0"), str(content.get("source")), content.get("movers0")
         if T is not None and source in ("oxts", "poses", "registration", "truth") and is_rigid(T, 1e-9):
@@ -144,52 +144,12 @@ def prepared_pair(
     pair = read_pair(sequence, frame0, scans, read_ego_motion(sequence, frame0, *scans))
     prepared = prepare_pair(pair, scan0, scan1, config)
     content = {"T_velo1_velo0": pair.ego_motion, "source": np.array(pair.ego_source)}
-    _store(path, content | {"movers0": np.packbits(prepared.movers0)})
+    store(path, content | {"movers0": np.packbits(prepared.movers0)})
     return pair, prepared, True
 
 
 def _sections(config: Config, *names: str) -> dict[str, Any]:
     return {name: getattr(config, name).model_dump(mode="json") for name in names}
-
-
-@cache
-def _program_digest() -> str:
-    """sha256 over the library's own source: another program never reads this one's cache."""
-    digest = hashlib.sha256()
-    for entry in sorted(resources.files("augkitti").iterdir(), key=lambda entry: entry.name):
-        if entry.name.endswith(".py"):
-            digest.update(entry.name.encode() + entry.read_bytes())
-    return digest.hexdigest()
-
-
-def _cache_path(cache_folder: Path, parts: list[Any]) -> Path:
-    key = hashlib.sha256(json.dumps([_FORMAT, _program_digest(), *parts], sort_keys=True).encode()).hexdigest()
-    return cache_folder / "prepared" / key[:2] / f"{key}.npz"
-
-
-def _load(path: Path) -> dict[str, Any] | None:
-    """The arrays of a cache file; None where there is none, or none that can be read and bears its own name."""
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-            content = {name: arrays[name] for name in arrays.files}
-        return content if str(content["key"]) == path.stem else None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
-        return None
-
-
-def _store(path: Path, arrays: dict[str, Any]) -> None:
-    buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        allow_pickle=False,  # not compressed: read for every pair, and a third of the scan's own size
-        key=np.array(path.stem),
-        **arrays,
-    )
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_whole(path, lambda file: file.write(buffer.getvalue()))
-    except OSError as err:
-        raise InputError(path.parent, f"the cache cannot be written ({err.strerror})", "set AUGKITTI_CACHE") from err
 
 
 def _pack(prepared: PreparedScan) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -26,15 +27,19 @@ from augkitti.dataset_index import (
     read_index,
     write_text,
 )
-from augkitti.errors import InputError
+from augkitti.errors import InputError, MachineError
 from augkitti.kitti import KittiRoot, Sequence, known_ego_motion, label_reach, open_root, read_labels
 from augkitti.scan_pair import CarModel
 from augkitti.scanner import ScannerProfile, load_profile
 from augkitti.shards import read_metadata, shard_metadata
+from pipelines.cache import cache_folder, program_digest
+from pipelines.lock import NAME as LOCK_NAME
+from pipelines.lock import check_free
 from pipelines.plan import ShardPlan, first_choice, plan_shards
 from pipelines.streets import Streets, find_streets
 
 WORK = ".augkitti-work"
+_STATE = "run.json"
 
 
 @dataclass(frozen=True)
@@ -107,15 +112,6 @@ class Run:
         return {name: tuple(sorted(frames[name])) for name in sorted(frames)}
 
 
-def cache_folder() -> Path:
-    """`$AUGKITTI_CACHE`, or `augkitti` in the user's cache folder."""
-    given = os.environ.get("AUGKITTI_CACHE")
-    if given:
-        return Path(given)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "augkitti"
-
-
 def open_run(options: Options) -> Run:
     """Check every input and draw the plan; reads names and small files, and writes nothing.
 
@@ -133,7 +129,7 @@ def open_run(options: Options) -> Run:
         raise InputError(root.path, f"holds no usable scan pair{why}", "give drives with consecutive scans")
     shards = plan_shards(pairs_of, options.n, options.seed, in_turn=options.kitti is None)
     identity = {
-        "program": augkitti.__version__,
+        "program version": f"{augkitti.__version__} ({program_digest()[:12]})",
         "pairs (--n)": options.n,
         "seed": options.seed,
         "configuration": options.config.model_dump(mode="json"),
@@ -218,6 +214,8 @@ def check_output(out: Path, resume: bool) -> None:
     try:
         if out.is_dir():
             held = sorted(path.name for path in out.iterdir())
+            if WORK in held:
+                check_free(out / WORK)
             foreign = [name for name in held if name not in (WORK, DATA_NAME, INDEX_NAME, SPLITS_NAME, CARD_NAME)]
             if held and not resume:
                 problem = "holds an unfinished run" if WORK in held else "is not empty"
@@ -240,7 +238,7 @@ def is_finished(run: Run) -> bool:
         InputError: it holds a finished data set made otherwise; names what differs.
     """
     out, options = run.options.out, run.options
-    if options.work.is_dir() or not (out / INDEX_NAME).is_file():
+    if (options.work / _STATE).is_file() or not (out / INDEX_NAME).is_file():
         return False
     index = read_index(out)
     wanted = shard_metadata(options.config, options.scanner, options.models)
@@ -264,6 +262,7 @@ def is_finished(run: Run) -> bool:
     if short == 0 and all(
         shard in readable and file_sha256(out / shard.path) == shard.sha256 for shard in index.shards
     ):
+        end_work(out)  # a run may have died just before
         return True
     for name in (INDEX_NAME, SPLITS_NAME, CARD_NAME):
         (out / name).unlink(missing_ok=True)
@@ -275,9 +274,10 @@ def start_work(run: Run, resume: bool) -> None:
 
     Raises:
         InputError: a run with other settings began there; names what differs.
+        MachineError: it cannot be written.
     """
     work = run.options.work
-    state = work / "run.json"
+    state = work / _STATE
     if resume and state.is_file():
         before = _read_state(state)["identity"]
         differs = [key for key in run.identity if before.get(key) != run.identity[key]]
@@ -302,7 +302,7 @@ def start_work(run: Run, resume: bool) -> None:
         (options.out / DATA_NAME).mkdir(exist_ok=True)
         write_text(state, json.dumps(content, indent=1))
     except OSError as err:
-        raise InputError(work, f"cannot be written ({err.strerror})", "take another --out") from err
+        raise MachineError(work, f"cannot be written ({err.strerror})", "make room, then go on with --resume") from err
 
 
 def reopen_run(out: Path) -> Run:
@@ -311,9 +311,8 @@ def reopen_run(out: Path) -> Run:
     Raises:
         InputError: there is no unfinished run, or its input is not what it was.
     """
-    state = out / WORK / "run.json"
-    if not state.is_file():
-        raise InputError(out, "holds no unfinished run", "begin with `augkitti prepare`, or use `augkitti generate`")
+    check_work(out)
+    state = out / WORK / _STATE
     content = _read_state(state)
     settings = content["options"]
     try:
@@ -335,6 +334,16 @@ def reopen_run(out: Path) -> Run:
     return run
 
 
+def check_work(out: Path) -> None:
+    """Refuse a folder without an unfinished run.
+
+    Raises:
+        InputError: as said.
+    """
+    if not (out / WORK / _STATE).is_file():
+        raise InputError(out, "holds no unfinished run", "begin with `augkitti prepare`, or use `augkitti generate`")
+
+
 def config_of(index: DatasetIndex) -> Config:
     """The configuration that a data set was made with.
 
@@ -350,7 +359,17 @@ def config_of(index: DatasetIndex) -> Config:
 
 def end_work(out: Path) -> None:
     """Take the work folder away: the data set is finished."""
-    shutil.rmtree(out / WORK, ignore_errors=True)
+    work = out / WORK
+    if not work.is_dir():
+        return
+    with suppress(OSError):
+        (work / _STATE).unlink(missing_ok=True)  # first: without it the run is no longer unfinished
+        shutil.rmtree(work / "rows", ignore_errors=True)
+        for path in work.iterdir():
+            if path.name != LOCK_NAME:
+                path.unlink(missing_ok=True)
+        (work / LOCK_NAME).unlink(missing_ok=True)  # last: until here no other run may begin
+        work.rmdir()
 
 
 def _read_state(path: Path) -> dict[str, Any]:

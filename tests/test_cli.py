@@ -8,7 +8,7 @@ import yaml
 from tiny_drive import write_drive
 from typer.testing import CliRunner
 
-import pipelines.run
+import pipelines.cache
 from augkitti.config import Config, load_config
 from augkitti.dataset_index import read_index
 from pipelines.cli import DEFAULT_OUT, app
@@ -150,10 +150,10 @@ def test_there_is_a_street_for_every_ten_pairs_at_least(n, tmp_path):
 
 def test_the_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     monkeypatch.setenv("AUGKITTI_CACHE", str(tmp_path / "a"))
-    assert pipelines.run.cache_folder() == tmp_path / "a"
+    assert pipelines.cache.cache_folder() == tmp_path / "a"
     monkeypatch.delenv("AUGKITTI_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
-    assert pipelines.run.cache_folder() == tmp_path / "b" / "augkitti"
+    assert pipelines.cache.cache_folder() == tmp_path / "b" / "augkitti"
 
 
 def test_the_embedded_default_is_generated_and_checked_against_the_streets_in_the_cache(augkitti, tmp_path):

@@ -1,0 +1,192 @@
+"""The cache on disk: names and arrays in, the same arrays out as long as they are there; bounded, oldest use out first.
+
+`CACHE/prepared/<2 digits>/<digest>.npz` is what `prepare` finds in scans and pairs, `CACHE/cad/car-<digest>.npz` are
+finished car models, `CACHE/streets/<digest>/` are embedded streets. A name is the digest of all that the content
+depends on, the program's own source among it: what is found is never stale. Nothing is lost but time with any of it.
+"""
+
+import hashlib
+import io
+import json
+import math
+import os
+import shutil
+import time
+import zipfile
+import zlib
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from augkitti.dataset_index import replace_whole
+from augkitti.errors import InputError, MachineError
+
+BOUND_GB = 32.0  # all of KITTI raw prepared is about 25 GB
+_FORMAT = "prepared 1"
+_PATTERNS = {"prepared": "[0-9a-f][0-9a-f]/*.npz", "cad": "car-*.npz", "streets": "[0-9a-f]*"}
+_LEFT_OVER = ("prepared/[0-9a-f][0-9a-f]/.*.tmp", "cad/*.part", "streets/.*.part-*")  # of runs that died
+_STREETS_STAY_S = _LEFT_OVER_STAYS_S = 86_400.0  # streets are a run's source: not taken from under one
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file of the cache, or the folder of one set of streets."""
+
+    kind: str
+    path: Path
+    bytes: int
+    used_s: float  # when it was last used, seconds since 1970
+
+
+def cache_folder() -> Path:
+    """`$AUGKITTI_CACHE`, or `augkitti` in the user's cache folder."""
+    given = os.environ.get("AUGKITTI_CACHE")
+    if given:
+        return Path(given)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "augkitti"
+
+
+def bound_bytes() -> float:
+    """How large the cache may become: `$AUGKITTI_CACHE_GB`, or 32 GB.
+
+    Raises:
+        InputError: the variable is no number from 0.
+    """
+    text = os.environ.get("AUGKITTI_CACHE_GB", str(BOUND_GB))
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value >= 0.0:
+        raise InputError("AUGKITTI_CACHE_GB", f"is `{text}`", "give gigabytes, 0 or more")
+    return value * 1e9
+
+
+@cache
+def program_digest() -> str:
+    """sha256 over the library's own source: another program never reads this one's cache."""
+    digest = hashlib.sha256()
+    for entry in sorted(resources.files("augkitti").iterdir(), key=lambda entry: entry.name):
+        if entry.name.endswith(".py"):
+            digest.update(entry.name.encode() + entry.read_bytes())
+    return digest.hexdigest()
+
+
+def entry_path(folder: Path, parts: list[Any]) -> Path:
+    """Where what depends on `parts` (JSON) and the program is kept."""
+    key = hashlib.sha256(json.dumps([_FORMAT, program_digest(), *parts], sort_keys=True).encode()).hexdigest()
+    return folder / "prepared" / key[:2] / f"{key}.npz"
+
+
+def load(path: Path) -> dict[str, Any] | None:
+    """The arrays of a cache file; None where there is none, or none that can be read and bears its own name."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
+            content = {name: arrays[name] for name in arrays.files}
+        if str(content["key"]) != path.stem:
+            return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+        return None
+    with suppress(OSError):  # a cache that may only be read serves as well
+        os.utime(path)  # used now: the last to go
+    return content
+
+
+def store(path: Path, arrays: dict[str, Any]) -> None:
+    """Keep arrays under a path of `entry_path`.
+
+    Raises:
+        MachineError: the disk refuses.
+    """
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        allow_pickle=False,  # not compressed: read for every pair, and a third of the scan's own size
+        key=np.array(path.stem),
+        **arrays,
+    )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_whole(path, lambda file: file.write(buffer.getvalue()))
+    except OSError as err:
+        problem = f"the cache cannot be written ({err.strerror or err})"
+        raise MachineError(path.parent, problem, "make room or set AUGKITTI_CACHE, then use --resume") from err
+
+
+def entries(folder: Path) -> list[Entry]:
+    """All that the cache keeps, longest unused first; what does not look like ours is not looked at."""
+    found = []
+    for kind, pattern in _PATTERNS.items():
+        for path in (folder / kind).glob(pattern):
+            try:
+                state = path.stat()
+                size = sum(file.stat().st_size for file in path.rglob("*")) if path.is_dir() else state.st_size
+            except OSError:
+                continue  # another run dropped it just now
+            found.append(Entry(kind, path, size, state.st_mtime))
+    return sorted(found, key=lambda entry: (entry.used_s, str(entry.path)))
+
+
+def trim(folder: Path, bound: float | None = None) -> int:
+    """Drop what was not used for longest until the cache fits; how many entries went.
+
+    Streets used within a day stay, and so may others' files that cannot be removed.
+
+    Raises:
+        InputError: as `bound_bytes`.
+    """
+    limit = bound_bytes() if bound is None else bound
+    now = time.time()
+    for pattern in _LEFT_OVER:
+        for path in folder.glob(pattern):
+            if now - _changed(path) > _LEFT_OVER_STAYS_S:
+                _remove(path)
+    there = entries(folder)
+    total, dropped = sum(entry.bytes for entry in there), 0
+    for entry in there:
+        if total <= limit:
+            break
+        if entry.kind == "streets" and now - entry.used_s < _STREETS_STAY_S:
+            continue
+        _remove(entry.path)
+        total, dropped = total - entry.bytes, dropped + 1
+    return dropped
+
+
+def clear(folder: Path) -> tuple[int, int]:
+    """Remove all that the cache keeps, nothing else; number of entries and bytes."""
+    gone = entries(folder)
+    for path in [*(entry.path for entry in gone), *(path for pattern in _LEFT_OVER for path in folder.glob(pattern))]:
+        _remove(path)
+    return len(gone), sum(entry.bytes for entry in gone)
+
+
+def _changed(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return math.inf
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+        return
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+
+
+def show_cache() -> None:
+    """Print where the cache is, what it keeps, and how large it may become."""
+    folder, bound = cache_folder(), bound_bytes()
+    there = entries(folder)
+    print(f"{folder}: {sum(entry.bytes for entry in there) / 1e9:,.2f} of at most {bound / 1e9:,.1f} GB")
+    for kind in _PATTERNS:
+        sizes = [entry.bytes for entry in there if entry.kind == kind]
+        print(f"  {kind}: {len(sizes):,}, {sum(sizes) / 1e9:,.2f} GB")
