@@ -199,16 +199,17 @@ def finish_pair(
 
 
 def _columns(prepared: PreparedScan, occluded: Occluded, instance: I16, first_car: int) -> AugmentedScan:
-    scan, rays, kept, new = prepared.scan, prepared.rays, occluded.kept, occluded.simulated
+    scan, rays, new = prepared.scan, prepared.rays, occluded.simulated
+    kept = np.flatnonzero(occluded.kept)
     return AugmentedScan(
-        xyz=_joined(scan.xyz[kept], new.xyz),
+        xyz=_joined(scan.xyz.take(kept, axis=0), new.xyz),
         reflectance=np.concatenate([scan.reflectance[kept], new.reflectance]),
         ring=np.concatenate([rays.ring[kept], new.ring]),
         tick=np.concatenate([rays.tick[kept], new.tick]),
         source=np.concatenate([scan.row[kept], np.full(len(new.xyz), -1, dtype=np.int32)]),
         instance=np.concatenate([instance[kept], (new.car + first_car).astype(np.int16)]),
-        surface=np.concatenate([np.full(int(kept.sum()), MEASURED, dtype=np.uint8), new.surface]),
-        removed=scan.row[~kept],
+        surface=np.concatenate([np.full(len(kept), MEASURED, dtype=np.uint8), new.surface]),
+        removed=scan.row[~occluded.kept],
     )
 
 

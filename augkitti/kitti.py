@@ -139,7 +139,9 @@ def find_sequences(root: Path) -> tuple[Sequence, ...]:
 
 def valid_rows(rows: Array) -> Bool:
     """Which rows (N, 4) of a scan file are measurements: finite, and not all zero (the contract's definition)."""
-    return np.asarray(np.isfinite(rows).all(axis=1) & (rows != 0.0).any(axis=1))
+    valid = (rows[:, 0] != 0.0) | (rows[:, 1] != 0.0) | (rows[:, 2] != 0.0) | (rows[:, 3] != 0.0)
+    finite = np.isfinite(rows)
+    return np.asarray(valid if finite.all() else valid & finite.all(axis=1))
 
 
 def read_scan_rows(path: Path) -> Array:
@@ -454,7 +456,7 @@ def _rows_of(content: bytes, path: Path) -> Array:
 def _scan_of(rows: Array, sequence: Sequence, frame: int) -> Scan:
     path = sequence.scan_path(frame)
     row = np.flatnonzero(valid_rows(rows)).astype(np.int32)
-    kept = rows[row]
+    kept = rows if len(row) == len(rows) else rows[row]
     if len(kept) < MIN_POINTS:
         raise InputError(path, f"holds {len(kept)} valid points, too few for a scan", _FETCH)
     reflectance = np.ascontiguousarray(kept[:, 3], dtype=np.float32)

