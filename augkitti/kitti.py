@@ -38,6 +38,10 @@ MIN_POINTS = 1000  # fewer valid points are no revolution of a 64-beam scanner
 
 _DEFAULT_PERIOD_S = 0.1035  # scanner.md: a revolution takes 103.2 to 103.6 ms
 _PACKET_AFTER_MIDDLE_S = 0.017  # scanner.md: the median delay of a scan's OXTS packet; used without OXTS timestamps
+_LAST_POINTS = 200
+# Rings stand top first, so a file that was cut ends too high up. KITTI's own last scans of a drive can lack rings (56
+# and 61 of 64 were seen): beam 48 of 64 looks down by 17.1 degrees.
+_LAST_ELEVATION_RAD = math.radians(-17.0)
 _MIN_QUADRANT_SHARE = 0.002  # a whole revolution sees ground on every side; a camera-view crop does not
 _FETCH = "fetch the file again"
 _TREE = (
@@ -469,6 +473,11 @@ def _scan_of(rows: Array, sequence: Sequence, frame: int) -> Scan:
     if quadrants.min() < _MIN_QUADRANT_SHARE * len(xyz):
         raise InputError(
             path, "does not see all round: a camera-view crop?", "take the whole scans of the KITTI download"
+        )
+    last = xyz[-_LAST_POINTS:].astype(np.float64)
+    if np.median(np.arctan2(last[:, 2], np.hypot(last[:, 0], last[:, 1]))) > _LAST_ELEVATION_RAD:
+        raise InputError(
+            path, f"is cut short: {len(rows)} points, and the lowest quarter of the beams is missing", _FETCH
         )
     time_s, period_s = scan_time(sequence, frame)
     return Scan(xyz, reflectance, row, len(rows), sequence.kind, time_s, period_s)

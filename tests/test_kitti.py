@@ -266,3 +266,21 @@ def test_tracklets_and_tracking_labels_of_one_drive_agree(kitti_root: Path) -> N
             assert near.category == tracklet.category
             np.testing.assert_allclose(near.box[:6], tracklet.box[:6], atol=0.03)
             assert abs(np.sin(near.box[6] - tracklet.box[6])) < 0.03
+
+
+@pytest.mark.kitti
+@pytest.mark.parametrize(("share", "is_read"), [(0.5, False), (0.75, False), (0.95, True)])
+def test_scan_cut_at_a_whole_point_is_told_by_the_beams_that_it_lacks(
+    kitti_root: Path, tmp_path: Path, share: float, is_read: bool
+) -> None:
+    source = sorted(kitti_root.glob("raw/*/*_0005_sync"))[0]
+    copy = tmp_path / "raw" / source.parent.name / source.name / "velodyne_points" / "data"
+    copy.mkdir(parents=True)
+    content = sorted((source / "velodyne_points" / "data").glob("*.bin"))[0].read_bytes()
+    (copy / "0000000000.bin").write_bytes(content[: int(len(content) * share) // 16 * 16])
+    (sequence,) = kitti.open_root(tmp_path).sequences
+    if is_read:
+        assert len(kitti.read_scan(sequence, 0)) > 100_000
+    else:
+        with pytest.raises(InputError, match="cut short"):
+            kitti.read_scan(sequence, 0)
