@@ -36,7 +36,7 @@ Kitti = Annotated[
     typer.Option(envvar="AUGKITTI_KITTI", help="Folder with KITTI in it. Without: embedded streets."),
 ]
 Out = Annotated[Path, typer.Option(help="Folder of the data set.")]
-Folder = Annotated[Path, typer.Argument(metavar="[OUT]", help="Folder of the data set.", show_default=True)]
+Folder = Annotated[Path, typer.Argument(metavar="[DATASET]", help="Folder of the data set.", show_default=True)]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
 Cad = Annotated[Path | None, typer.Option(help="Folder of car models. Without: cars made in code.")]
@@ -54,6 +54,23 @@ Profile = Annotated[Path | None, typer.Option(help="Scanner profile (JSON). With
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings (YAML); see `augkitti config show`.")]
 OnError = Annotated[Literal["skip", "stop"], typer.Option(help="Leave out pairs whose source is unreadable, or stop.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run.")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        import augkitti
+
+        print(f"augkitti {augkitti.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _augkitti(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Augmented KITTI: virtual cars with exact motion labels in real LiDAR scans."""
 
 
 @contextmanager

@@ -18,7 +18,18 @@ from pipelines.finish import finish_set
 from pipelines.lock import hold
 from pipelines.plan import ShardPlan
 from pipelines.prepare import prepare_all
-from pipelines.run import WORK, Options, Run, check_output, check_work, is_finished, open_run, reopen_run, start_work
+from pipelines.run import (
+    WORK,
+    Options,
+    Run,
+    check_output,
+    check_work,
+    is_finished,
+    load_library,
+    open_run,
+    reopen_run,
+    start_work,
+)
 from pipelines.shard_row import ShardRow, read_row
 from pipelines.stage import console
 from pipelines.streets import Streets, make_streets
@@ -27,6 +38,7 @@ from pipelines.streets import Streets, make_streets
 BYTES_PER_PAIR = 3.3e6
 BYTES_PER_PREPARED_SCAN = 0.48e6
 BYTES_PER_STREET_SCAN = 2.0e6
+_SKIPPED_SHOWN = 8  # rows of the closing table; the index has them all
 SECONDS_PER_PAIR = 0.7
 SECONDS_PER_PREPARED_SCAN = 0.35
 SECONDS_PER_STREET_SCAN = 0.4
@@ -73,10 +85,25 @@ def _begin(options: Options, jobs: int, resume: bool) -> Run:
     if options.streets is None:
         run = open_run(options)
         print(_first_line(options), flush=True)
+        _print_notes(run)
         return run
     print(_first_line(options), flush=True)
     make_streets(options.streets, options.scanner, jobs)
-    return open_run(options)
+    run = open_run(options)
+    _print_notes(run)
+    return run
+
+
+def _print_notes(run: Run) -> None:
+    """What a user may not expect of the inputs, a line each."""
+    options = run.options
+    if options.cad is not None and options.config.cars[1] > 0:
+        library = load_library(options.cad, options.config.categories, options.cache)
+        left_out = sum(decision.problem is not None for decision in library.report)
+        print(f"car models: {len(library.models)} used, {left_out} left out (`augkitti cad check` says why)")
+    there = sum(len(sequence.pairs) for sequence in run.sequences.values())
+    if options.config.cars[1] == 0 and options.n > there:
+        print(f"note: plain pairs do not vary, and there are {there} scan pairs: some are written more than once")
 
 
 def _prepare(run: Run, jobs: int, resume: bool) -> None:
@@ -151,13 +178,13 @@ def _first_line(options: Options) -> str:
 
 def _print_totals(run: Run, rows: list[ShardRow], made: int, seconds: float | None) -> None:
     totals: Counter[str] = Counter()
-    reasons: Counter[str] = Counter()
+    skipped: Counter[tuple[str, str]] = Counter()
     for entry in run.left_out:
-        reasons[entry["reason"]] += entry["count"]
+        skipped[entry["source"], entry["reason"]] += entry["count"]
     for row in rows:
         totals.update(row.totals)
         for entry in row.skipped:
-            reasons[entry["reason"]] += entry["count"]
+            skipped[entry["source"], entry["reason"]] += entry["count"]
     entries = [row.entry for row in rows if row.entry is not None]
     table = Table(title=str(run.options.out), show_header=False, title_justify="left")
     table.add_row("pairs", f"{made:,} of {run.options.n:,}")
@@ -169,8 +196,10 @@ def _print_totals(run: Run, rows: list[ShardRow], made: int, seconds: float | No
         table.add_row("rows dropped (NaN or zeros)", f"{totals['invalid_rows']:,}")
     if seconds is not None:
         table.add_row("time", f"{seconds:,.1f} s, {made / max(seconds, 1e-9):.2f} pairs/s")
-    for reason, count in sorted(reasons.items()):
-        table.add_row("skipped", f"{count:,} x {reason}")
+    for (source, reason), count in skipped.most_common(_SKIPPED_SHOWN):
+        table.add_row("skipped", f"{source}: {reason} ({count:,} pairs tried)")
+    if len(skipped) > _SKIPPED_SHOWN:
+        table.add_row("skipped", f"and {len(skipped) - _SKIPPED_SHOWN:,} more, all in dataset.json")
     console().print(table)
 
 

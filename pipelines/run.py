@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import augkitti
 from augkitti.config import Config, load_config
@@ -37,6 +37,9 @@ from pipelines.lock import NAME as LOCK_NAME
 from pipelines.lock import check_free
 from pipelines.plan import ShardPlan, first_choice, plan_shards
 from pipelines.streets import Streets, find_streets
+
+if TYPE_CHECKING:
+    from augkitti.cad_models import CadLibrary
 
 WORK = ".augkitti-work"
 _STATE = "run.json"
@@ -126,7 +129,8 @@ def open_run(options: Options) -> Run:
     pairs_of = [(name, len(sequence.pairs)) for name, sequence in sorted(sequences.items())]
     if not pairs_of:
         why = f"; {left_out[0]['source']}: {left_out[0]['reason']}" if left_out else ""
-        raise InputError(root.path, f"holds no usable scan pair{why}", "give drives with consecutive scans")
+        remedy = "fetch that file again, or give other drives" if left_out else "give drives with consecutive scans"
+        raise InputError(root.path, f"holds no usable scan pair{why}", remedy)
     shards = plan_shards(pairs_of, options.n, options.seed, in_turn=options.kitti is None)
     identity = {
         "program version": f"{augkitti.__version__} ({program_digest()[:12]})",
@@ -141,17 +145,23 @@ def open_run(options: Options) -> Run:
 
 
 @lru_cache(maxsize=2)
+def load_library(cad: Path, categories: tuple[str, ...], cache: Path) -> "CadLibrary":
+    """The models of a folder, read once a process."""
+    from augkitti.cad_models import load_cad_folder
+
+    return load_cad_folder(cad, categories, cache / "cad")
+
+
 def load_models(cad: Path | None, config: Config, cache: Path) -> tuple[CarModel, ...]:
     """The car models of the wanted categories, from a folder or made in code.
 
     Raises:
         InputError: the folder is missing or holds no usable model of the categories.
     """
-    from augkitti.cad_models import load_cad_folder
     from augkitti.parametric_cars import parametric_cars
 
     if cad is not None:
-        return load_cad_folder(cad, config.categories, cache / "cad").models
+        return load_library(cad, config.categories, cache).models
     models = parametric_cars()
     wanted = tuple(model for model in models if model.category in config.categories)
     if not wanted:
