@@ -112,8 +112,8 @@ class MotionConfig(_Section):
 
     standing_share: float = Field(default=0.15, ge=0.0, description="weight of standing cars")
     slow_share: float = Field(default=0.25, ge=0.0, description="weight of cars slower than `slow_mps`")
-    town_share: float = Field(default=0.15, ge=0.0, description="weight of cars between `slow_mps` and `town_mps`")
-    fast_share: float = Field(default=0.45, ge=0.0, description="weight of cars between `town_mps` and `fast_mps`")
+    town_share: float = Field(default=0.20, ge=0.0, description="weight of cars between `slow_mps` and `town_mps`")
+    fast_share: float = Field(default=0.40, ge=0.0, description="weight of cars between `town_mps` and `fast_mps`")
     slow_mps: float = Field(default=4.0, gt=0.0, description="upper end of slow speeds")
     town_mps: float = Field(default=15.0, gt=0.0, description="upper end of town speeds")
     fast_mps: float = Field(default=34.0, gt=0.0, description="highest speed")
