@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+KITTI ?= ../shared/kitti
+CAD ?= ../shared/cad
+STREETS ?= build/streets
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check lint types bench clean
@@ -31,8 +34,16 @@ types: $(STAMP)
 
 check: lint types test ## what CI runs
 
-bench: $(STAMP) ## speed and accuracy figures of docs/figures.md
-	for b in benchmarks/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+bench: $(STAMP) ## speed and accuracy figures of docs/figures.md, on KITTI=, CAD= and STREETS= (made if absent)
+	test -d $(STREETS) || $(BIN)/augkitti synthesize --out $(STREETS) --drives 10 --frames 3 --seed 0
+	$(BIN)/python benchmarks/rays.py $(KITTI)
+	$(BIN)/python benchmarks/ego_motion.py $(KITTI)
+	$(BIN)/python benchmarks/ground.py $(KITTI) $(STREETS)
+	$(BIN)/python benchmarks/movers.py --seed 11
+	$(BIN)/python benchmarks/movers.py --kitti $(KITTI)
+	$(BIN)/python benchmarks/cad_library.py $(CAD)
+	$(BIN)/python benchmarks/window_shares.py $(KITTI) $(CAD)
+	$(BIN)/python benchmarks/street_vs_real.py $(KITTI) $(STREETS)
 
 clean: ## remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build *.egg-info

@@ -198,6 +198,7 @@ def load_config(path: Path | None, **changes: Any) -> Config:
     except ValidationError as err:
         first = err.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
+        problem = "is unknown" if first["type"] == "extra_forbidden" else first["msg"]
         raise InputError(
-            path or "options", f"key `{key}`: {first['msg']}", "see `augkitti config show` for keys and defaults"
+            path or "options", f"key `{key}`: {problem}", "see `augkitti config show` for keys and defaults"
         ) from err

@@ -125,6 +125,6 @@ def _points_of(prepared: PreparedScan, boxes: list[F64 | None]) -> I16:
 
 def _near(xyz: Array, box: F64, grow_m: float) -> npt.NDArray[np.intp]:
     """Indices of the points (N, 3) in the upright square round a box, grown all round: a first, quick choice."""
-    reach = float(np.hypot(box[3], box[4])) / 2.0 + grow_m + 0.01
+    reach = float(np.hypot(box[3] / 2.0 + grow_m, box[4] / 2.0 + grow_m)) + 0.01
     near = np.flatnonzero(np.abs(xyz[:, 0] - float(box[0])) <= reach)
     return np.asarray(near[np.abs(xyz[near, 1] - float(box[1])) <= reach])

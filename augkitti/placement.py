@@ -76,7 +76,6 @@ class PlacementScene:
     scans: tuple[SceneScan, SceneScan]
     twist: F64  # (6,) of the scanner, per second
     interval_s: float
-    rolling: bool  # whether a body's moment hangs on its bearing
     raw: bool
     cell_xy: F64  # (C, 2) centres of drivable cells of scan 0 within range, velo0
     cell_heading_rad: F64  # (C,) of the road at these cells, along the ego road rather than against it
@@ -89,14 +88,13 @@ class PlacementScene:
 def make_scene(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan, config: Config) -> PlacementScene:
     """Work out what every proposal in a pair needs."""
     raw = pair.scan0.kind == "raw"
-    rolling = raw and config.shutter == "rolling"
     interval = pair.scan1.time_s - pair.scan0.time_s
     twist = ego_twist(pair.ego_motion, interval)
     scans = (
-        _scene_scan(prepared0, 0.0, rolling, pair.labels0),
-        _scene_scan(prepared1, interval, rolling, pair.labels1),
+        _scene_scan(prepared0, 0.0, raw, pair.labels0),
+        _scene_scan(prepared1, interval, raw, pair.labels1),
     )
-    half = 0.5 * pair.scan0.period_s if rolling else 0.0
+    half = 0.5 * pair.scan0.period_s if raw else 0.0
     times = np.linspace(-half, interval + half, 9)
     T_world_ego = T_world_scanner(twist, times)
     cell_xy, cell_heading = _drivable_cells(prepared0.region, config.placement)
@@ -104,13 +102,12 @@ def make_scene(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan,
         scans=scans,
         twist=twist,
         interval_s=interval,
-        rolling=rolling,
         raw=raw,
         cell_xy=cell_xy,
         cell_heading_rad=cell_heading,
         cell_chance=_cell_chances(cell_xy, cell_heading, prepared0.region.road_heading_rad, config.placement),
         check_times_s=times,
-        label_quads=_label_quads(pair, twist, times, rolling, config.placement.box_gap_m),
+        label_quads=_label_quads(pair, twist, times, raw, config.placement.box_gap_m),
         ego_quads=_quads(compose(T_world_ego, _planar_pose(_EGO_BOX)), _EGO_BOX[3:5], config.placement.box_gap_m)[None],
     )
 
@@ -318,7 +315,7 @@ def _planar_at_scan1(scene: PlacementScene, model: CarModel, drive: Drive, xy: F
 
 def _moments(scene: PlacementScene, k: int, xy: F64) -> F64:
     """When (M,) seconds from scan k's middle its azimuth passes places (M, 2)."""
-    if not scene.rolling:
+    if not scene.raw:
         return np.zeros(len(xy))
     share = wrap_angle(np.arctan2(xy[:, 1], xy[:, 0])) / (2.0 * np.pi)  # `azimuth_time` of many
     return np.asarray(-share * scene.scans[k].prepared.scan.period_s, dtype=np.float64)
@@ -354,7 +351,7 @@ def _stand(
         T_world_car1 = compose(T_world_car0, se3_exp(level_twist, elapsed))
         pose1 = compose(invert(T_world_scanner(scene.twist, scene.interval_s + moment1)), T_world_car1)
         before = moment1
-        if scene.rolling:
+        if scene.raw:
             moment1 = azimuth_time(float(np.arctan2(pose1[1, 3], pose1[0, 3])), scene.scans[1].prepared.scan.period_s)
         if abs(moment1 - before) < 1e-9:
             break
@@ -408,7 +405,7 @@ def _pose_on_ground(
         T_world_scanner(scene.twist, here.middle_s + moment_s), np.column_stack([at, height])
     )
     other = transform_points(invert(T_world_scanner(scene.twist, there.middle_s)), contact_world)
-    if scene.rolling:  # the other scan sees the place when its azimuth passes it
+    if scene.raw:  # the other scan sees the place when its azimuth passes it
         passes = there.middle_s + float(_moments(scene, 1 - k, other[:, :2].mean(axis=0)[None])[0])
         other = transform_points(invert(T_world_scanner(scene.twist, passes)), contact_world)
     if not _is_observed(there.prepared.ground, other[:, :2]).any():

@@ -99,8 +99,9 @@ def _print_notes(run: Run) -> None:
     options = run.options
     if options.cad is not None and options.config.cars[1] > 0:
         library = load_library(options.cad, options.config.categories, options.cache)
-        left_out = sum(decision.problem is not None for decision in library.report)
-        print(f"car models: {len(library.models)} used, {left_out} left out (`augkitti cad check` says why)")
+        left_out = len(library.report) - len(library.models)
+        wanted = ", ".join(options.config.categories)
+        print(f"car models: {len(library.models)} used ({wanted}), {left_out} not (`augkitti cad check` says why)")
     there = sum(len(sequence.pairs) for sequence in run.sequences.values())
     if options.config.cars[1] == 0 and options.n > there:
         print(f"note: plain pairs do not vary, and there are {there} scan pairs: some are written more than once")

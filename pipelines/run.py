@@ -130,7 +130,8 @@ def open_run(options: Options) -> Run:
     if not pairs_of:
         why = f"; {left_out[0]['source']}: {left_out[0]['reason']}" if left_out else ""
         remedy = "fetch that file again, or give other drives" if left_out else "give drives with consecutive scans"
-        raise InputError(root.path, f"holds no usable scan pair{why}", remedy)
+        notes = sorted({sequence.note for sequence in root.sequences if sequence.note})
+        raise InputError(root.path, "; ".join([f"holds no usable scan pair{why}", *notes]), remedy)
     shards = plan_shards(pairs_of, options.n, options.seed, in_turn=options.kitti is None)
     identity = {
         "program version": f"{augkitti.__version__} ({program_digest()[:12]})",
@@ -177,7 +178,7 @@ def _usable(root: KittiRoot, options: Options) -> tuple[dict[str, Sequence], lis
         pairs = sequence.pairs
         if not pairs:
             continue
-        problem = _drive_problem(sequence)
+        problem = _drive_problem(sequence) or _scans_problem(sequence)
         if problem is None:
             usable[sequence.name] = sequence
         elif options.stop_on_error:
@@ -204,6 +205,16 @@ def _drive_problem(sequence: Sequence) -> InputError | None:
             places.add(err.where)
             problem = err
     return problem if len(places) == 1 and len(sequence.pairs) > 1 else None
+
+
+def _scans_problem(sequence: Sequence) -> InputError | None:
+    """The fault of a drive in which no pair has two files of whole points; looks at sizes, stops at a good pair."""
+    for frame0, frame1 in sequence.pairs:
+        sizes = [sequence.scan_path(frame).stat().st_size for frame in (frame0, frame1)]
+        if all(size > 0 and size % 16 == 0 for size in sizes):
+            return None
+    path = sequence.scan_path(sequence.pairs[0][0])
+    return InputError(path, "is empty or cut short, as is a scan of every pair of its drive", "fetch the drive again")
 
 
 def skip_entry(err: InputError, root: Path, count: int) -> dict[str, Any]:

@@ -17,6 +17,8 @@ from augkitti.pair_motion import T_world_scanner, ego_twist
 from augkitti.parametric_cars import parametric_cars
 from augkitti.scan_pair import AugmentedPair, PreparedPair, ScanPair, VirtualCar
 from augkitti.scanner import azimuth_time, load_profile
+from augkitti.shards import shard_metadata
+from augkitti.validate import rules_of, validate_pair
 
 PROFILE = load_profile()
 MODELS = tuple(model for model in parametric_cars() if model.category == "Car")
@@ -108,10 +110,15 @@ def test_no_cars_asked_for_gives_the_plain_pair_with_its_real_labels(source) -> 
     assert (result.scan0.source >= 0).all()
 
 
-def test_snapshot_shutter_has_all_cars_at_the_middle_of_the_scan(source) -> None:
-    for _, item in virtual(augmented(source, shutter="snapshot")):
-        assert item.moment0 == 0.0
-        assert item.moment1 == 0.0
+def test_snapshot_shutter_freezes_each_car_at_its_moment(source) -> None:
+    pair, _ = source
+    for seed in range(3):
+        result = augmented(source, seed, shutter="snapshot")
+        for row, item in virtual(result):
+            bearing = float(np.arctan2(item.box0[1], item.box0[0]))
+            assert item.moment0 == pytest.approx(azimuth_time(bearing, pair.scan0.period_s), abs=1e-6)
+            local = transform_points(invert(item.pose0), result.scan0.xyz[result.scan0.instance == row])
+            assert (np.abs(local) <= item.box0[3:6] / 2 + 0.13).all()  # beam bias and noise, and no shear
 
 
 def test_pair_without_room_gives_nothing(source) -> None:
@@ -147,3 +154,15 @@ def test_car_that_the_sweep_would_shear_out_of_its_box_is_told(source, speed_mps
     here = replace(cast, hits=(cast.hits[0],) * 2, returns=(cast.returns[0],) * 2)
     assert here.returns[0].returned.sum() > 500
     assert keeps_its_shape(car, here, scan0, scan0, PROFILE) is keeps
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"glass": "opaque"}, {"shutter": "snapshot"}, {"cars": (0, 0)}, {"cars": (2, 3)}, {"min_points": 60}],
+    ids=str,
+)
+def test_every_way_of_casting_passes_validation(source, settings) -> None:
+    rules = rules_of(shard_metadata(Config(**settings), PROFILE, MODELS), "test")
+    for seed in range(3):
+        offences = validate_pair(augmented(source, seed, **settings), rules)
+        assert offences == []

@@ -111,3 +111,15 @@ def test_flow_is_the_motion_of_the_points_body_and_of_the_world_elsewhere(twist:
         xyz @ ego[:3, :3].T + ego[:3, 3] - xyz,
     )
     np.testing.assert_allclose(flow, truth, atol=2e-5)
+
+
+def test_shell_reaches_into_the_corners_of_a_turned_box(pair: ScanPair) -> None:
+    here, size = np.array([14.0, 4.0]), np.array([2.0, 2.0, 1.5])
+    box = np.concatenate([here, [GROUND_Z_M + 0.75], size, [np.pi / 4]])
+    further = box + np.array([3.0, 0, 0, 0, 0, 0, 0])
+    corner = np.array([[here[0] - np.sqrt(2) * 1.18, here[1], -1.0]], dtype=np.float32)
+    scan0 = replace(pair.scan0, xyz=np.concatenate([corner, pair.scan0.xyz[1:]]))
+    labels = [replace(pair.labels0[0], box=b) for b in (box, further)]
+    moved = replace(pair, scan0=scan0, labels0=(labels[0],), labels1=(labels[1],))
+    found = label_points(moved, replace(prepared(pair.scan0), scan=scan0), prepared(pair.scan1))
+    assert found.unknown0[0]
