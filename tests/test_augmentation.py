@@ -35,7 +35,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> tuple[ScanPair, Prepared
 
 def augmented(source, seed: int = 5, **settings) -> AugmentedPair:
     pair, prepared = source
-    result = augkitti.augment_pair(pair, MODELS, PROFILE, Config(**settings), seed, "tiny/0/0", prepared)
+    result = augkitti.augment_pair(pair, MODELS, PROFILE, Config(**settings), seed, f"{pair.sequence}/0/0", prepared)
     assert result is not None
     return result
 
