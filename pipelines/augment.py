@@ -31,7 +31,7 @@ TRIM_EVERY = 100  # shards between two looks at the size of the cache
 NO_ROOM = "no virtual car found room"
 
 
-def augment_all(run: Run, jobs: int) -> list[ShardRow]:
+def augment_all(run: Run, jobs: int, scheduler: str | None = None) -> list[ShardRow]:
     """Make every shard of the plan that is not there yet; the rows of all, by shard.
 
     Raises:
@@ -41,7 +41,7 @@ def augment_all(run: Run, jobs: int) -> list[ShardRow]:
     items = [(shard, run.sequences[shard.sequence]) for shard in run.shards]
     task = partial(augment_shard, options=run.options)
     rows = []
-    for row in run_tasks(task, items, jobs, "pairs", weight=lambda item: item[0].quota):
+    for row in run_tasks(task, items, jobs, "pairs", lambda item: item[0].quota, scheduler):
         rows.append(row)
         if len(rows) % TRIM_EVERY == 0:
             trim(run.options.cache)

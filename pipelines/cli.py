@@ -38,6 +38,9 @@ Kitti = Annotated[
 Out = Annotated[Path, typer.Option(help="Folder of the data set.")]
 Folder = Annotated[Path, typer.Argument(metavar="[DATASET]", help="Folder of the data set.", show_default=True)]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers make the shards: tcp://host:8786.")
+]
 Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
 Cad = Annotated[Path | None, typer.Option(help="Folder of car models. Without: cars made in code.")]
 Pairs = Annotated[int, typer.Option("--n", min=1, help="Pairs to make.")]
@@ -135,6 +138,7 @@ def generate(
     config: ConfigFile = None,
     on_error: OnError = "skip",
     resume: Resume = False,
+    scheduler: Scheduler = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the plan with disk and time; touch nothing.")
     ] = False,
@@ -149,7 +153,7 @@ def generate(
             stop_on_error=on_error == "stop", cars=_cars(cars), categories=_categories(categories),
             min_points=min_points, glass=glass, shutter=shutter,
         )  # fmt: skip
-        raise typer.Exit(run(options, jobs=jobs, resume=resume, dry_run=dry_run))
+        raise typer.Exit(run(options, jobs=jobs, resume=resume, dry_run=dry_run, scheduler=scheduler))
 
 
 @app.command()
@@ -184,12 +188,12 @@ def prepare(
 
 
 @app.command()
-def augment(out: Folder = DEFAULT_OUT, jobs: Jobs = 1) -> None:
+def augment(out: Folder = DEFAULT_OUT, jobs: Jobs = 1, scheduler: Scheduler = None) -> None:
     """Stage 2 of generate. Reads the plan, scans, cache, car models; writes OUT/data/*.parquet and a row for each."""
     with _answers():
         from pipelines.generate import augment_stage
 
-        augment_stage(out, jobs=jobs)
+        augment_stage(out, jobs=jobs, scheduler=scheduler)
 
 
 @app.command()

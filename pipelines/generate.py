@@ -31,7 +31,7 @@ from pipelines.run import (
     start_work,
 )
 from pipelines.shard_row import ShardRow, read_row
-from pipelines.stage import console
+from pipelines.stage import check_scheduler, console
 from pipelines.streets import Streets, make_streets
 
 # Measured on real scans with real CAD models, seconds of one core; docs/figures.md, "Generation". For --dry-run only.
@@ -44,8 +44,11 @@ SECONDS_PER_PREPARED_SCAN = 0.35
 SECONDS_PER_STREET_SCAN = 0.4
 
 
-def generate(options: Options, jobs: int, resume: bool, dry_run: bool) -> int:
+def generate(options: Options, jobs: int, resume: bool, dry_run: bool, scheduler: str | None = None) -> int:
     """Run all stages, or print the plan.
+
+    With the address of a Dask scheduler its workers make the shards. Each prepares what it needs itself, for the cache
+    need not be one that all of them see.
 
     Returns:
         0, or 1 where fewer pairs were made than asked for.
@@ -57,13 +60,18 @@ def generate(options: Options, jobs: int, resume: bool, dry_run: bool) -> int:
     if dry_run:
         return show_plan(options, jobs)
     started = time.monotonic()
+    if scheduler is not None:
+        check_scheduler(scheduler)
     run = _begin(options, jobs, resume)
     if resume and is_finished(run):
         print(f"{options.out} is finished and whole: nothing to do")
         return 0
     with hold(options.work):
-        _prepare(run, jobs, resume)
-        rows = augment_all(run, jobs)
+        if scheduler is None:
+            _prepare(run, jobs, resume)
+        else:
+            start_work(run, resume)
+        rows = augment_all(run, jobs, scheduler)
         return _close(run, rows, time.monotonic() - started)
 
 
@@ -122,14 +130,14 @@ def _prepare(run: Run, jobs: int, resume: bool) -> None:
     print(f"prepared: {made} made, {kept} found in {options.cache}", file=sys.stderr)
 
 
-def augment_stage(out: Path, jobs: int) -> None:
+def augment_stage(out: Path, jobs: int, scheduler: str | None = None) -> None:
     """Make the shards of the plan in `out`'s work folder.
 
     Raises:
         InputError: there is no plan, or a source is unreadable and the run is to stop there.
     """
     with _reopened(out) as run:
-        augment_all(run, jobs)
+        augment_all(run, jobs, scheduler)
 
 
 def finish_stage(out: Path) -> int:

@@ -1,6 +1,7 @@
 """One stage: independent tasks in, their results out as they come, with progress on a terminal.
 
 A task gets one thread for arithmetic: workers do not fight over cores, and no sum depends on how many there are.
+Tasks run in processes of this machine, or on the workers of a Dask scheduler; joblib hands them out either way.
 """
 
 import os
@@ -8,21 +9,33 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from typing import TypeVar
+from contextlib import ExitStack
+from typing import Any, TypeVar
 
 from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from augkitti.errors import MachineError
+from augkitti.errors import InputError, MachineError
+from pipelines.cache import program_digest
+
+WORKERS_COME_S = 600.0  # how long a scheduler without workers is waited for: a batch system starts them when it can
+_CONNECT_S = 20.0
+_AHEAD = 4_096  # tasks a scheduler is given beyond those that run: enough for workers that join later
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 def run_tasks(
-    task: Callable[[Item], Result], items: Sequence[Item], jobs: int, what: str, weight: Callable[[Item], int]
+    task: Callable[[Item], Result],
+    items: Sequence[Item],
+    jobs: int,
+    what: str,
+    weight: Callable[[Item], int],
+    scheduler: str | None = None,
 ) -> Iterator[Result]:
     """Run a task on each item with `jobs` processes; results in no particular order.
 
@@ -32,24 +45,31 @@ def run_tasks(
         jobs: number of processes; 1 runs here.
         what: the name of what is counted, for the progress line.
         weight: how many of them an item is.
+        scheduler: address of a Dask scheduler, whose workers run the tasks instead; `jobs` is not used then.
 
     Raises:
-        MachineError: a worker process died.
+        InputError: the scheduler does not answer, or Dask is not installed.
+        MachineError: a worker process died (with a scheduler: several under one task), or is of another program.
     """
     total = sum(weight(item) for item in items)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
     quiet = not sys.stderr.isatty()
-    with (
-        parallel_config(backend="loky", inner_max_num_threads=1),
-        Progress(
-            *columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True), disable=quiet
-        ) as bar,
-    ):
+    with ExitStack() as stack:
+        if scheduler is None:
+            stack.enter_context(parallel_config(backend="loky", inner_max_num_threads=1))
+            workers, ahead, weighed, here = min(jobs, max(1, len(items))), "2 * n_jobs", _weighed, str(os.getpid())
+        else:
+            client = stack.enter_context(_connected(scheduler))
+            waits = {"client": client, "wait_for_workers_timeout": WORKERS_COME_S}
+            stack.enter_context(parallel_config(backend="dask", **waits))
+            workers, ahead, weighed, here = -1, f"2 * n_jobs + {_AHEAD}", _on_worker, program_digest()
+        bar = stack.enter_context(
+            Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True), disable=quiet)
+        )
         line = bar.add_task(what, total=total, rate="")
-        run = Parallel(n_jobs=min(jobs, max(1, len(items))), return_as="generator_unordered", batch_size=1)
-        here = os.getpid()
         try:
-            for result, done in run(delayed(_weighed)(task, item, weight(item), here) for item in items):
+            run = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1, pre_dispatch=ahead)
+            for result, done in run(delayed(weighed)(task, item, weight(item), here) for item in items):
                 bar.advance(line, done)
                 speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
                 bar.update(line, rate=f"{speed:.1f} {what}/s" if speed else "")
@@ -57,10 +77,66 @@ def run_tasks(
         except BrokenProcessPool as err:
             problem = "a worker process was killed, as happens when memory runs out"
             raise MachineError(what, problem, "use fewer --jobs, then go on with --resume") from err
+        except (CancelledError, TimeoutError) as err:  # none but Dask's
+            problem = f"the scheduler was lost, or has no workers ({type(err).__name__})"
+            raise MachineError(str(scheduler), problem, "start it and its workers, then go on with --resume") from err
+        except Exception as err:
+            if type(err).__name__ != "KilledWorker":  # Dask's: several workers died one after another under one task
+                raise
+            problem = "workers kept dying under one task, as happens when memory runs out or time is up"
+            raise MachineError(str(scheduler), problem, "see docs/scale.md, then go on with --resume") from err
 
 
-def _weighed(task: Callable[[Item], Result], item: Item, weight: int, main: int) -> tuple[Result, int]:
-    if os.getpid() != main and threading.current_thread() is threading.main_thread():
+def check_scheduler(scheduler: str) -> None:
+    """See that a Dask scheduler answers.
+
+    Raises:
+        InputError: as `run_tasks`.
+    """
+    _connected(scheduler).close()
+
+
+def _connected(scheduler: str) -> Any:
+    """A client of a Dask scheduler.
+
+    Raises:
+        InputError: as `run_tasks`.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--scheduler", "needs Dask", 'pip install "augkitti[distributed]"') from None
+    try:
+        return Client(scheduler, timeout=_CONNECT_S)
+    except (OSError, ValueError) as err:
+        problem = f"does not answer ({type(err).__name__})"
+        raise InputError(f"--scheduler {scheduler}", problem, "give one such as tcp://host:8786") from err
+
+
+def _on_worker(task: Callable[[Item], Result], item: Item, weight: int, main: str) -> tuple[Result, int]:
+    """On a worker of a scheduler, which may be another machine: first see that it would make the same bytes.
+
+    Args:
+        task: what to run.
+        item: what to run it on.
+        weight: handed back with the result.
+        main: the digest of the main process's program.
+
+    Raises:
+        MachineError: the worker's program is another, or it shares its process between tasks.
+    """
+    from distributed import get_worker
+
+    worker = get_worker()
+    if program_digest() != main:
+        raise MachineError(worker.address, "has another version of augkitti", "install the same on every worker")
+    if worker.state.nthreads != 1:
+        raise MachineError(worker.address, "runs several tasks at once", "start workers with --nthreads 1")
+    return task(item), weight
+
+
+def _weighed(task: Callable[[Item], Result], item: Item, weight: int, main: str) -> tuple[Result, int]:
+    if str(os.getpid()) != main and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all: the main process answers, and ends workers
     return task(item), weight
 
