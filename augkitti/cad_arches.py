@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from augkitti import same_math as sm
 from augkitti.cad_axes import surface_points
 from augkitti.frames import F64
 from augkitti.scan_pair import I32
@@ -67,7 +68,7 @@ def _circles(edge_x: F64, edge_z: F64, radius_m: float) -> F64:
         if len(px) < 20:
             continue
         z = np.arange(float(pz.max()) - 1.35 * radius_m, float(pz.max()) - 0.95 * radius_m, 0.01)
-        distance = np.hypot(px, pz - z[:, None])  # (Z, P)
+        distance = sm.hypot(px, pz - z[:, None])  # (Z, P)
         above = (pz > z[:, None])[:, None, :] & (np.abs(px) <= 0.87 * radii[:, None])
         on_arc = (np.abs(distance[:, None, :] - radii[:, None]) < _ON_ARC_M) & above  # (Z, R, P)
         share = on_arc.sum(axis=2) / (2.0 * 0.87 * radii / _BIN_M)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import F64
 from augkitti.scan_pair import I32, Bool
@@ -63,7 +64,7 @@ def level_axes(vertices: F64, faces: I32, up: tuple[float, float, float] | None)
         for axis in range(3):
             base = _base(np.eye(3)[axis])
             yaw, error = mirror_yaw(_turn(points, base))
-            extent = np.ptp(_turn(points, _about_z(yaw) @ base), axis=0)
+            extent = np.ptp(_turn(points, sm.product(_about_z(yaw), base)), axis=0)
             if extent[0] > extent[2]:  # no vehicle is higher than long
                 tried.append((error, axis, yaw))
         if not tried:
@@ -73,9 +74,9 @@ def level_axes(vertices: F64, faces: I32, up: tuple[float, float, float] | None)
         reasons = [f"up axis: {'xyz'[axis]}, by the left-right mirror plane"]
     if error > 0.35:
         raise InputError("model", f"no left-right symmetry to tell its axes by ({error:.2f})", _REMEDY)
-    turned = _about_z(yaw) @ base
+    turned = sm.product(_about_z(yaw), base)
     if up is None and _upside_down(_turn(points, turned)):
-        turned = np.diag([1.0, -1.0, -1.0]) @ turned
+        turned = sm.product(np.diag([1.0, -1.0, -1.0]), turned)
         reasons = [f"{reasons[0]}, pointing down"]
     if abs(yaw) > 1e-9:
         reasons.append(f"yaw {math.degrees(yaw):.2f} degrees, by the mirror plane")

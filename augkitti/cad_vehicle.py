@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from augkitti import same_math as sm
 from augkitti.cad_alignment import Wheel, axles, contact_axles, find_wheels, merge_vertices
 from augkitti.cad_arches import find_arches
 from augkitti.cad_axes import Cues, find_unit, forward_sign, forward_votes, level_axes
@@ -208,7 +209,7 @@ def _axes(path: Path, raw: RawModel, facts: ModelFacts, source: str) -> tuple[F6
     votes = forward_votes(centred, level.faces, cues, axles(wheels) or contact_axles(centred, level.faces))
     if facts.forward_axis is None:
         sign, why = forward_sign(path, votes)
-        R = np.diag([sign, sign, 1.0]) @ R
+        R = sm.product(np.diag([sign, sign, 1.0]), R)
         said.append(why)
     elif sum(v for _, v in votes) < -BACKWARDS_VOTE:
         against = ", ".join(f"{cue} {-value:+.2f}" for cue, value in votes)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from augkitti import same_math as sm
 from augkitti._bev_grid import I64, cell_centres, cell_of, interpolate
 from augkitti.config import DrivableConfig
 from augkitti.frames import F64, Array
@@ -81,10 +82,10 @@ class _Grid:
 
 
 def _low_points(p: F64, above: F64, rays: ScanRays, ground: GroundMap, config: DrivableConfig) -> _Low:
-    smooth = ndimage.gaussian_filter(ground.height_m.astype(np.float64), _RELIEF_M / ground.cell_m)
-    r = np.hypot(p[:, 0], p[:, 1])
+    smooth = sm.gaussian_filter(ground.height_m.astype(np.float64), _RELIEF_M / ground.cell_m)
+    r = sm.hypot(p[:, 0], p[:, 1])
     near = np.flatnonzero((np.abs(above) < config.low_m + 0.1) & (r < 1.42 * config.reach_m))
-    key = rays.ring[near] * _TURN + np.arctan2(p[near, 1], p[near, 0])
+    key = rays.ring[near] * _TURN + sm.arctan2(p[near, 1], p[near, 0])
     order = np.argsort(key, kind="stable")
     near, key = near[order], key[order]
     r = np.maximum(r[near], 1.0)
@@ -137,7 +138,7 @@ def _seen_or_passed_over(low: _Low, edge: Bool, ground: GroundMap, grid: _Grid, 
 def _along(start: F64, end: F64, step_m: float) -> F64:
     """Places (K, 2) on the straight lines from starts (M, 2) to ends (M, 2), at most `step_m` apart."""
     offset = end - start
-    steps = np.ceil(np.hypot(offset[:, 0], offset[:, 1]) / step_m).astype(np.int64) + 1
+    steps = np.ceil(sm.hypot(offset[:, 0], offset[:, 1]) / step_m).astype(np.int64) + 1
     line = np.repeat(np.arange(len(start)), steps)
     nth = np.arange(len(line)) - np.repeat(np.cumsum(steps) - steps, steps)
     share = nth / np.maximum(steps - 1, 1)[line]
@@ -174,7 +175,7 @@ def _past_the_ego_car(xy: F64, range_m: F64, ring: I64, step_m: float) -> F64:
     beside &= (np.abs(offset[:, 0]) > 1.0) & (np.abs(offset[:, 1]) < 0.4 * np.abs(offset[:, 0]))
     beside &= np.abs(xy[1:, 1] + xy[:-1, 1]) > 2.4  # wider than the ego car itself
     line = _along(xy[:-1][beside], xy[1:][beside], step_m)
-    return np.asarray(line[np.hypot(line[:, 0], line[:, 1]) < _UNSEEN_M])
+    return np.asarray(line[sm.hypot(line[:, 0], line[:, 1]) < _UNSEEN_M])
 
 
 def _kerbs(low: _Low, grid: _Grid, config: DrivableConfig) -> Bool:
@@ -247,10 +248,10 @@ def _road_heading(blocked: Bool, grid: _Grid) -> float:
     bins = int(2 * (_HEADING_REACH_M + 2.0) / _LATERAL_BIN_M)
     scores = np.empty(len(tried))
     for k, heading in enumerate(tried):
-        lateral = across * np.cos(heading) - along * np.sin(heading)
+        lateral = across * sm.cos(heading) - along * sm.sin(heading)
         count = np.bincount((lateral / _LATERAL_BIN_M + bins / 2).astype(np.int64), minlength=bins).astype(np.float64)
-        near = ndimage.gaussian_filter1d(count, 2.0)  # wider than a cell, or the grid's own rows would line up best
-        scores[k] = (near * near).sum() * np.exp(-0.5 * (heading / _HEADING_SPREAD_RAD) ** 2)
+        near = sm.gaussian_filter(count, 2.0)  # wider than a cell, or the grid's own rows would line up best
+        scores[k] = (near * near).sum() * sm.exp(-0.5 * (heading / _HEADING_SPREAD_RAD) ** 2)
     best = int(np.argmax(scores))
     if 0 < best < len(tried) - 1:  # between the directions tried: the vertex of the parabola through the best three
         before, at, after = scores[best - 1 : best + 2]

@@ -11,11 +11,12 @@ import numpy as np
 import small_gicp
 from scipy.spatial import cKDTree
 
+from augkitti import same_math as sm
 from augkitti.frames import F64, Array, compose, invert, orthonormal, pose_from_xyz_yaw, rigid, se3_exp, se3_log
 from augkitti.scan_pair import Scan
 
 EgoSource = Literal["oxts", "poses", "registration", "truth"]
-METHOD = "ego-motion 1"  # part of cache keys: raise it when a figure below or the method changes
+METHOD = "ego-motion 2"  # part of cache keys: raise it when a figure below or the method changes
 
 _ROLL, _PITCH, _YAW, _VN, _VE, _VU = 3, 4, 5, 6, 7, 10  # columns of an OXTS row
 
@@ -51,7 +52,7 @@ def oxts_motion(rows: Array, packet_time_s: Array, time0_s: float, time1_s: floa
     velocity_enu = np.stack([_linear(knots, times, rows[:, column]) for column in (_VE, _VN, _VU)], axis=1)
     travel_enu = (0.5 * (velocity_enu[1:] + velocity_enu[:-1]) * np.diff(knots)[:, None]).sum(axis=0)
 
-    T_imu0_imu1 = rigid(R_enu_imu0.T @ R_enu_imu1, R_enu_imu0.T @ travel_enu)
+    T_imu0_imu1 = rigid(sm.product(R_enu_imu0.T, R_enu_imu1), sm.product(R_enu_imu0.T, travel_enu))
     T_velo0_velo1 = compose(compose(T_velo_imu, T_imu0_imu1), invert(T_velo_imu))
     return invert(orthonormal(T_velo0_velo1))
 
@@ -152,7 +153,8 @@ def _align(xyz0: Array, xyz1: Array, T_velo1_velo0: F64, voxel_m: float, reach_m
         rotation_epsilon=1e-6,  # the default, 0.1 degrees, stops where rotations are still wrong by more than that
         num_threads=1,  # more threads change the order of sums, and so the last bits
     )
-    return orthonormal(np.asarray(result.T_target_source))
+    twist = se3_log(orthonormal(np.asarray(result.T_target_source)))
+    return se3_exp(np.round(twist, 9))  # its last bits depend on the processor; a nanometre does not
 
 
 def _upright(xyz: Array) -> Array:
@@ -163,22 +165,22 @@ def _upright(xyz: Array) -> Array:
 
 def _rotation(row: Array) -> F64:
     """`R_enu_imu` (3, 3) of one OXTS row."""
-    cr, sr = np.cos(row[_ROLL]), np.sin(row[_ROLL])
-    cp, sp = np.cos(row[_PITCH]), np.sin(row[_PITCH])
-    cy, sy = np.cos(row[_YAW]), np.sin(row[_YAW])
+    cr, sr = sm.cos(row[_ROLL]), sm.sin(row[_ROLL])
+    cp, sp = sm.cos(row[_PITCH]), sm.sin(row[_PITCH])
+    cy, sy = sm.cos(row[_YAW]), sm.sin(row[_YAW])
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
     about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(about_z @ about_y @ about_x)
+    return np.asarray(sm.product(sm.product(about_z, about_y), about_x))
 
 
 def _orientation(rows: Array, times: Array, moment_s: float) -> F64:
     """`R_enu_imu` (3, 3) at a moment, turning evenly between packets and on beyond the ends."""
     low = int(np.clip(np.searchsorted(times, moment_s, side="right") - 1, 0, len(times) - 2))
     before, after = _rotation(rows[low]), _rotation(rows[low + 1])
-    turn = se3_log(rigid(before.T @ after, np.zeros(3)))
+    turn = se3_log(rigid(sm.product(before.T, after), np.zeros(3)))
     share = (moment_s - times[low]) / (times[low + 1] - times[low])
-    return np.asarray(before @ se3_exp(turn, share)[:3, :3])
+    return np.asarray(sm.product(before, se3_exp(turn, share)[:3, :3]))
 
 
 def _linear(at: Array, times: Array, values: Array) -> F64:

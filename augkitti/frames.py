@@ -15,9 +15,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from augkitti import same_math as sm
+
 Array = npt.NDArray[Any]
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+
+_POLAR_STEPS = 8  # twice what a matrix a percent off needs
 
 
 def transform_points(T_a_b: F64, points_b: Array) -> F64:
@@ -70,28 +74,42 @@ def rigid(R: Array, t: Array) -> F64:
 
 
 def orthonormal(T: F64) -> F64:
-    """The nearest rigid motion to a matrix (4, 4) whose rotation is a few digits short (files, products of many)."""
-    u, _, vt = np.linalg.svd(np.asarray(T, dtype=np.float64)[:3, :3])
-    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    """The nearest rigid motion to a matrix (4, 4) whose rotation is a few digits short (files, products of many).
+
+    Newton's iteration for the polar decomposition; a matrix far from any rotation (see `is_rigid`) is no input.
+    """
+    R = np.array(T, dtype=np.float64)[:3, :3]
+    for _ in range(_POLAR_STEPS):
+        cofactors = _cofactors(R)
+        R = 0.5 * (R + cofactors / _sum3(R[0] * cofactors[0]))
     return rigid(R, np.asarray(T, dtype=np.float64)[:3, 3])
+
+
+def _cofactors(R: F64) -> F64:
+    """The transposed inverse of a matrix (3, 3) times its determinant."""
+    return np.stack([np.cross(R[1], R[2]), np.cross(R[2], R[0]), np.cross(R[0], R[1])])
+
+
+def _sum3(values: F64) -> float:
+    return float(values[0] + values[1] + values[2])
 
 
 def is_rigid(T: Array, tolerance: float = 1e-6) -> bool:
     """Whether a matrix (4, 4) is a proper rigid motion to `tolerance`."""
     T = np.asarray(T, dtype=np.float64)
-    if T.shape != (4, 4) or not np.isfinite(T).all():
+    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[:3, :3]).max() > 2.0:
         return False
     R = T[:3, :3]
     return bool(
-        np.abs(R @ R.T - np.eye(3)).max() <= tolerance
-        and abs(np.linalg.det(R) - 1.0) <= tolerance
+        np.abs(sm.product(R, R.T) - np.eye(3)).max() <= tolerance
+        and abs(_sum3(R[0] * _cofactors(R)[0]) - 1.0) <= tolerance
         and np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() <= tolerance
     )
 
 
 def pose_from_xyz_yaw(x: float, y: float, z: float, yaw_rad: float) -> F64:
     """A pose (4, 4) turned by yaw about z, counter-clockwise from +x."""
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    c, s = sm.cos(yaw_rad), sm.sin(yaw_rad)
     return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -99,7 +117,7 @@ def pose_on_slope(x: float, y: float, z: float, yaw_rad: float, normal: Array) -
     """A pose (4, 4) whose z axis is `normal` (3,) and whose x axis projects onto heading `yaw_rad` seen from above."""
     n = np.asarray(normal, dtype=np.float64)
     n = n / np.sqrt((n * n).sum())
-    heading = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0])
+    heading = np.array([sm.cos(yaw_rad), sm.sin(yaw_rad), 0.0])
     heading[2] = -(n[0] * heading[0] + n[1] * heading[1]) / n[2]  # in the plane, same azimuth
     forward = heading / np.sqrt((heading * heading).sum())
     return rigid(np.stack([forward, np.cross(n, forward), n], axis=1), np.array([x, y, z]))
@@ -107,7 +125,7 @@ def pose_on_slope(x: float, y: float, z: float, yaw_rad: float, normal: Array) -
 
 def yaw_of(T_a_b: Array) -> float:
     """Heading of b's x axis in a, seen from above, radians."""
-    return float(np.arctan2(T_a_b[1, 0], T_a_b[0, 0]))
+    return float(sm.arctan2(T_a_b[1, 0], T_a_b[0, 0]))
 
 
 def wrap_angle(angle_rad: Any) -> Any:
@@ -121,14 +139,15 @@ def se3_log(T_a_b: F64) -> F64:
     R = T[:3, :3]
     axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = float(np.sqrt((axis * axis).sum()))
-    angle = float(np.arctan2(sine, 0.5 * (np.trace(R) - 1.0)))
+    angle = float(sm.arctan2(sine, 0.5 * (np.trace(R) - 1.0)))
     w = axis * (angle / sine if sine > 1e-12 else 1.0)
     W = _cross_matrix(w)
     if angle < 1e-6:
-        V_inv = np.eye(3) - 0.5 * W + W @ W / 12.0
+        V_inv = np.eye(3) - 0.5 * W + sm.product(W, W) / 12.0
     else:
-        V_inv = np.eye(3) - 0.5 * W + (1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))) * (W @ W)
-    return np.concatenate([V_inv @ T[:3, 3], w])
+        s, c = sm.sincos(angle)
+        V_inv = np.eye(3) - 0.5 * W + (1.0 / (angle * angle) - (1.0 + c) / (2.0 * angle * s)) * sm.product(W, W)
+    return np.concatenate([sm.product(V_inv, T[:3, 3]), w])
 
 
 def se3_exp(twist: F64, factor: Any = 1.0) -> F64:
@@ -138,14 +157,17 @@ def se3_exp(twist: F64, factor: Any = 1.0) -> F64:
     rate = float(np.sqrt((w * w).sum()))
     angle = rate * tau
     W = _cross_matrix(w)
-    WW = W @ W
+    WW = sm.product(W, W)
     if rate < 1e-9:
-        a, b, c = tau, 0.5 * tau**2, tau**3 / 6.0
+        a, b, c = tau, 0.5 * tau * tau, tau * tau * tau / 6.0
     else:
-        a, b, c = np.sin(angle) / rate, (1.0 - np.cos(angle)) / rate**2, (angle - np.sin(angle)) / rate**3
+        sine, cosine = sm.sincos(angle)
+        a, b = sine / rate, (1.0 - cosine) / (rate * rate)
+        c = (angle - sine) / (rate * rate * rate)
+        a, b, c = np.asarray(a), np.asarray(b), np.asarray(c)
     out = np.zeros(tau.shape + (4, 4), dtype=np.float64)
     out[..., :3, :3] = np.eye(3) + a[..., None, None] * W + b[..., None, None] * WW
-    out[..., :3, 3] = tau[..., None] * v + b[..., None] * (W @ v) + c[..., None] * (WW @ v)
+    out[..., :3, 3] = tau[..., None] * v + b[..., None] * sm.product(W, v) + c[..., None] * sm.product(WW, v)
     out[..., 3, 3] = 1.0
     return out
 
@@ -170,7 +192,7 @@ def footprint_corners(box: Array, grow_m: float = 0.0) -> F64:
     """The four ground-plane corners (4, 2) of a contract box, counter-clockwise from front left."""
     x, y, yaw = float(box[0]), float(box[1]), float(box[6])
     half_l, half_w = float(box[3]) / 2.0 + grow_m, float(box[4]) / 2.0 + grow_m
-    c, s = np.cos(yaw), np.sin(yaw)
+    c, s = sm.cos(yaw), sm.sin(yaw)
     local = np.array([[half_l, half_w], [-half_l, half_w], [-half_l, -half_w], [half_l, -half_w]])
     return np.stack([x + local[:, 0] * c - local[:, 1] * s, y + local[:, 0] * s + local[:, 1] * c], axis=1)
 
@@ -180,8 +202,8 @@ def footprints_overlap(corners_a: F64, corners_b: F64) -> bool:
     for quad in (corners_a, corners_b):
         edges = np.roll(quad, -1, axis=0) - quad
         normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
-        along_a = normals @ corners_a.T
-        along_b = normals @ corners_b.T
+        along_a = sm.product(normals, corners_a.T)
+        along_b = sm.product(normals, corners_b.T)
         if ((along_a.max(1) < along_b.min(1)) | (along_b.max(1) < along_a.min(1))).any():
             return False
     return True

@@ -8,6 +8,7 @@ square cells, robust against all that stands on the ground. Heights in steps two
 import numpy as np
 from scipy import ndimage
 
+from augkitti import same_math as sm
 from augkitti._bev_grid import cell_centres, cell_of, fill_smoothly, interpolate, mean_by_cell
 from augkitti.config import GroundConfig
 from augkitti.frames import F32, F64, Array
@@ -44,7 +45,7 @@ def fit_ground(xyz: F32, config: GroundConfig) -> GroundMap:
     x, y = cell_centres(origin, config.cell_m, (cells, cells))
     height = height + _ring_height(ring_surface, *np.broadcast_arrays(x, y))
     height = height - (plane[0] * x + plane[1] * y + plane[3]) / plane[2]
-    allowed = np.clip(config.above_m + 0.002 * np.hypot(p[:, 0], p[:, 1]), 0.0, 2.0 * config.above_m)
+    allowed = np.clip(config.above_m + 0.002 * sm.hypot(p[:, 0], p[:, 1]), 0.0, 2.0 * config.above_m)
     return GroundMap(
         plane=plane,
         origin_m=origin,
@@ -98,7 +99,7 @@ def _fit_plane(p: F64, config: GroundConfig) -> F64:
     if len(q) >= 10:
         seen = np.bincount(flat, minlength=cells * cells) > 0
         x, y, z = (mean_by_cell(flat, q[:, k], cells * cells)[0][seen] for k in range(3))
-        weight = np.exp(-0.5 * ((x / 10.0) ** 2 + (y / 4.0) ** 2))
+        weight = sm.exp(-0.5 * ((x / 10.0) ** 2 + (y / 4.0) ** 2))
         level = _ransac(x, y, z, weight, level, config)
     normal = np.array([-level[0], -level[1], 1.0])
     plane = np.append(normal, -level[2]) / np.sqrt((normal * normal).sum())
@@ -117,8 +118,8 @@ def _ransac(x: F64, y: F64, z: F64, weight: F64, level: F64, config: GroundConfi
     area = np.where(wide, area, 1.0)
     a, b = (uz * vy - uy * vz) / area, (ux * vz - uz * vx) / area
     c = pz[:, 0] - a * px[:, 0] - b * py[:, 0]
-    steepest = np.tan(config.max_tilt_rad)
-    fits = wide & (np.hypot(a, b) < steepest) & (-c > config.min_height_m) & (-c < config.max_height_m)
+    steepest = sm.tan(config.max_tilt_rad)
+    fits = wide & (sm.hypot(a, b) < steepest) & (-c > config.min_height_m) & (-c < config.max_height_m)
     candidates = np.concatenate([level[None], np.stack([a, b, c], axis=1)[fits]])
     residual = z[None, :] - candidates[:, :1] * x - candidates[:, 1:2] * y - candidates[:, 2:]
     cost = (np.minimum((residual / config.inlier_m) ** 2, 1.0) * weight).sum(axis=1)
@@ -127,7 +128,7 @@ def _ransac(x: F64, y: F64, z: F64, weight: F64, level: F64, config: GroundConfi
         error = z - best[0] * x - best[1] * y - best[2]
         trust = weight * np.maximum(1.0 - (error / config.inlier_m) ** 2, 0.0) ** 2
         best = _weighted_plane(x, y, z, trust, best)
-    steep = float(np.hypot(best[0], best[1]))
+    steep = float(sm.hypot(best[0], best[1]))
     bounded = steep < steepest and config.min_height_m < -best[2] < config.max_height_m
     return np.asarray(best if bounded else level, dtype=np.float64)
 
@@ -149,7 +150,7 @@ def _weighted_plane(x: F64, y: F64, z: F64, weight: F64, otherwise: F64) -> F64:
 
 def _grow_outwards(p: F64, above_plane: F64, config: GroundConfig) -> F64:
     """Heights above the plane (rings, sectors), each ring sought near what the ring inside of it leads to expect."""
-    r = np.hypot(p[:, 0], p[:, 1])
+    r = sm.hypot(p[:, 0], p[:, 1])
     rings = len(_RING_EDGES_M) - 1
     ring = np.searchsorted(_RING_EDGES_M, r, side="right") - 1
     sector = _sector_units(p[:, 0], p[:, 1]).astype(np.int64) % _SECTORS
@@ -195,13 +196,13 @@ def _over_sectors(values: F64, trust: F64) -> F64:
 
 
 def _sector_units(x: F64, y: F64) -> F64:
-    return np.asarray((np.arctan2(y, x) + np.pi) * (_SECTORS / (2.0 * np.pi)))
+    return np.asarray((sm.arctan2(y, x) + np.pi) * (_SECTORS / (2.0 * np.pi)))
 
 
 def _ring_height(surface: F64, x: F64, y: F64) -> F64:
     """The ring surface at places, bilinear in range and azimuth; 0 under the car."""
     middle = np.concatenate([[0.0], 0.5 * (_RING_EDGES_M[1:] + _RING_EDGES_M[:-1])])
-    r = np.hypot(x, y)
+    r = sm.hypot(x, y)
     ring_units = np.interp(r, middle, np.arange(len(middle)) + 0.5)
     padded = np.concatenate([np.zeros((1, _SECTORS)), surface])
     padded = np.concatenate([padded[:, -1:], padded, padded[:, :1]], axis=1)
@@ -228,7 +229,7 @@ def _refine(
     mean, count = mean_by_cell(flat[keep], above_rings[keep], cells * cells)
     support = np.minimum(count, 20.0).reshape(shape)
     height = fill_smoothly(mean.reshape(shape), support, 2.0, 6)
-    height = ndimage.gaussian_filter(height, 0.7)
+    height = sm.gaussian_filter(height, 0.7)
     observed = ndimage.binary_dilation(support > 0, iterations=2)
     return above_rings - interpolate(height, u, v), height, np.asarray(observed)
 

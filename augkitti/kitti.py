@@ -27,6 +27,7 @@ from typing import Any, Literal
 import numpy as np
 
 from augkitti import manifest
+from augkitti import same_math as sm
 from augkitti.ego_motion import METHOD, EgoMotion, find_ego_motion, odometry_motion, oxts_motion
 from augkitti.errors import InputError
 from augkitti.frames import F64, Array, compose, invert, is_rigid, orthonormal, rigid, rotate_vectors
@@ -475,7 +476,7 @@ def _scan_of(rows: Array, sequence: Sequence, frame: int) -> Scan:
             path, "does not see all round: a camera-view crop?", "take the whole scans of the KITTI download"
         )
     last = xyz[-_LAST_POINTS:].astype(np.float64)
-    if np.median(np.arctan2(last[:, 2], np.hypot(last[:, 0], last[:, 1]))) > _LAST_ELEVATION_RAD:
+    if np.median(sm.arctan2(last[:, 2], sm.hypot(last[:, 0], last[:, 1]))) > _LAST_ELEVATION_RAD:
         raise InputError(
             path, f"is cut short: {len(rows)} points, and the lowest quarter of the beams is missing", _FETCH
         )
@@ -556,10 +557,10 @@ def _entry(calib: dict[str, str], path: Path, keys: tuple[str, ...], count: int)
 
 
 def _rigid_of(R: Array, t: Array, where: str) -> F64:
-    T = orthonormal(rigid(R.reshape(3, 3), t))
-    if np.abs(T[:3, :3] - R.reshape(3, 3)).max() > 1e-3:
+    T = rigid(R.reshape(3, 3), t)
+    if not is_rigid(T, 2e-3):
         raise InputError(where, "is no rotation", _FETCH)
-    return T
+    return orthonormal(T)
 
 
 def _rigid_calib(path: Path) -> F64 | None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from augkitti import same_math as sm
 from augkitti.frames import (
     F64,
     Array,
@@ -102,11 +103,11 @@ def _object(pair: ScanPair, first: LabelledBox | None, second: LabelledBox | Non
 def _moment(kind: str, label: LabelledBox | None, period_s: float) -> float:
     if label is None or kind == "compensated":
         return 0.0
-    return azimuth_time(float(np.arctan2(label.box[1], label.box[0])), period_s)
+    return azimuth_time(float(sm.arctan2(label.box[1], label.box[0])), period_s)
 
 
 def _at_seam(box: F64 | None) -> bool:
-    return box is not None and abs(float(wrap_angle(np.arctan2(box[1], box[0]) - np.pi))) < SEAM_RAD
+    return box is not None and abs(float(wrap_angle(sm.arctan2(box[1], box[0]) - np.pi))) < SEAM_RAD
 
 
 def _points_of(prepared: PreparedScan, boxes: list[F64 | None]) -> I16:
@@ -125,6 +126,6 @@ def _points_of(prepared: PreparedScan, boxes: list[F64 | None]) -> I16:
 
 def _near(xyz: Array, box: F64, grow_m: float) -> npt.NDArray[np.intp]:
     """Indices of the points (N, 3) in the upright square round a box, grown all round: a first, quick choice."""
-    reach = float(np.hypot(box[3] / 2.0 + grow_m, box[4] / 2.0 + grow_m)) + 0.01
+    reach = float(sm.hypot(box[3] / 2.0 + grow_m, box[4] / 2.0 + grow_m)) + 0.01
     near = np.flatnonzero(np.abs(xyz[:, 0] - float(box[0])) <= reach)
     return np.asarray(near[np.abs(xyz[near, 1] - float(box[1])) <= reach])

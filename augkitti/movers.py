@@ -25,6 +25,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from augkitti import same_math as sm
 from augkitti.config import MoversConfig
 from augkitti.frames import F64, Array, se3_exp, se3_log, transform_points
 from augkitti.ground import height_at
@@ -101,7 +102,7 @@ def unlabelled_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: Prepar
         return np.zeros(len(pair.scan0), dtype=bool)
     movers = find_movers(pair, prepared0, prepared1, config)
     if pair.label_coverage == "camera" and pair.label_azimuth is not None:
-        azimuth = np.arctan2(pair.scan0.xyz[:, 1], pair.scan0.xyz[:, 0])
+        azimuth = sm.arctan2(pair.scan0.xyz[:, 1], pair.scan0.xyz[:, 0])
         movers &= (azimuth < pair.label_azimuth[0]) | (azimuth > pair.label_azimuth[1])
     return movers
 
@@ -124,7 +125,7 @@ def find_movers(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan
             of_found[suspect.members] = True
         of_found[_companions(both, found, of_found, config)] = True
         moving[_with_feet(both.view0.rows[of_found], prepared0, config)] = True
-    if float(np.hypot(pair.ego_motion[0, 3], pair.ego_motion[1, 3])) >= config.min_motion_m:
+    if float(sm.hypot(pair.ego_motion[0, 3], pair.ego_motion[1, 3])) >= config.min_motion_m:
         moving[_ego_body(prepared0)] = True
     return moving
 
@@ -139,7 +140,7 @@ def find_suspects(
 
 def moves(suspect: Suspect, config: MoversConfig) -> bool:
     """Step 4 of the test."""
-    step = float(np.hypot(suspect.motion_m[0], suspect.motion_m[1]))
+    step = float(sm.hypot(suspect.motion_m[0], suspect.motion_m[1]))
     # What is seen from aside and goes along itself contradicts at its two ends only.
     share = max(config.min_against, 0.3 * min(step / max(suspect.length_m, 0.5), 0.5))
     better = suspect.misfit_moved_m <= config.max_misfit_ratio * suspect.misfit_still_m
@@ -204,7 +205,7 @@ def _suspect(both: _Both, members: I64, config: MoversConfig) -> Suspect | None:
     """Step 3 of the test for some points of view0; None where nothing speaks against their standing."""
     view0, view1 = both.view0, both.view1
     low, high = view0.points[members].min(axis=0), view0.points[members].max(axis=0)
-    length = float(np.hypot(high[0] - low[0], high[1] - low[1]))
+    length = float(sm.hypot(high[0] - low[0], high[1] - low[1]))
     if len(members) < config.min_points or length > config.max_length_m:
         return None
     near = np.zeros(0, dtype=np.int64)
@@ -300,7 +301,7 @@ def _distance(tree: cKDTree, points: F64) -> F64:
 def _view(prepared: PreparedScan, per_second: F64, start_s: float, config: MoversConfig) -> _View:
     scan, rays = prepared.scan, prepared.rays
     xyz = scan.xyz.astype(np.float64)
-    across = np.hypot(xyz[:, 0], xyz[:, 1])
+    across = sm.hypot(xyz[:, 0], xyz[:, 1])
     rows = np.flatnonzero(~prepared.ground.is_ground & (across < config.reach_m))
     height = xyz[rows, 2] - height_at(prepared.ground, xyz[rows, :2])
     rows = rows[(height > config.min_height_m) & (height < _TOP_M)]
@@ -311,9 +312,9 @@ def _view(prepared: PreparedScan, per_second: F64, start_s: float, config: Mover
 
     rings = int(rays.ray_ring.max()) + 1
     elevation = _mean_by(rays.ray_ring, rays.ray_elevation_rad, rings)
-    height_m = _mean_by(rays.ring, xyz[:, 2] - np.tan(elevation)[rays.ring] * across, rings)
+    height_m = _mean_by(rays.ring, xyz[:, 2] - sm.tan(elevation)[rays.ring] * across, rings)
     image = np.full(rings * _COLUMNS, np.inf)
-    pixel = rays.ring.astype(np.int64) * _COLUMNS + _column(np.arctan2(xyz[:, 1], xyz[:, 0]))
+    pixel = rays.ring.astype(np.int64) * _COLUMNS + _column(sm.arctan2(xyz[:, 1], xyz[:, 0]))
     np.minimum.at(image, pixel, np.sqrt((xyz * xyz).sum(axis=1)))
     azimuth = (np.arange(_COLUMNS) + 0.5) / _COLUMNS * 2.0 * np.pi - np.pi
     # The scanner turns clockwise and looks straight ahead at the scan's middle (scanner.md section 1).
@@ -335,15 +336,15 @@ def _look(view: _View, points_world: F64) -> tuple[Bool, Bool]:
     T = view.T_scanner_world
     at = transform_points(T[_COLUMNS // 2], points_world)
     for _ in range(2):  # when the scanner looks there depends on where the point is then
-        at = transform_points(T[_column(np.arctan2(at[:, 1], at[:, 0]))], points_world)
-    across = np.hypot(at[:, 0], at[:, 1])
+        at = transform_points(T[_column(sm.arctan2(at[:, 1], at[:, 0]))], points_world)
+    across = sm.hypot(at[:, 0], at[:, 1])
     distance = np.sqrt((at * at).sum(axis=1))
-    column = _column(np.arctan2(at[:, 1], at[:, 0]))
+    column = _column(sm.arctan2(at[:, 1], at[:, 0]))
     rings = len(view.elevation_rad)
     between = -0.5 * (view.elevation_rad[1:] + view.elevation_rad[:-1])  # rising
     ring = np.full(len(at), rings // 2)
     for _ in range(2):  # beams start at two heights
-        elevation = np.arctan2(at[:, 2] - view.height_m[ring], across)
+        elevation = sm.arctan2(at[:, 2] - view.height_m[ring], across)
         ring = np.searchsorted(between, -elevation)
     outside = (elevation > view.elevation_rad[0] + 0.004) | (elevation < view.elevation_rad[-1] - 0.004)
 
@@ -386,7 +387,7 @@ def _best_motions(points: F64, others: F64, new: F64, tree1: cKDTree, config: Mo
     """
     reach = int(config.max_motion_m / _MAP_M)
     steps = np.arange(-reach, reach + 1)
-    far = np.hypot(steps[:, None], steps[None, :])
+    far = sm.hypot(steps[:, None], steps[None, :])
     costs = [_cost(points, others, steps) + np.where(far <= reach, 0.01 * _MAP_M * far, 9.0)]
     low, high = points[:, :2].min(axis=0) - config.max_motion_m, points[:, :2].max(axis=0) + config.max_motion_m
     new = new[((new[:, :2] > low) & (new[:, :2] < high)).all(axis=1)]

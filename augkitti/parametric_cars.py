@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from augkitti import same_math as sm
 from augkitti.cad_vehicle import finished_model
 from augkitti.frames import F64
 from augkitti.scan_pair import GLASS, LAMP, OTHER, PAINT, TYRE, CarModel
@@ -129,7 +130,7 @@ class _Shape:
         """Half width: narrower towards nose and tail, at the sill, and above the belt up to the roof."""
         s = self.spec
         to_end = np.minimum(self.nose_x - x, (x - self.end_x) + (0.0 if s.box_m is None else 9.0))
-        ends = 1.0 - 0.16 * np.clip(1.0 - to_end / 0.6, 0.0, 1.0) ** 2.5
+        ends = 1.0 - 0.16 * sm.power(np.clip(1.0 - to_end / 0.6, 0.0, 1.0), 2.5)
         low = np.clip((s.belt_m * 0.72 - z) / (s.belt_m * 0.72 - s.sill_m), 0.0, 1.0)
         shoulder = np.clip((z - s.belt_m * 0.72) / (s.belt_m * 0.28), 0.0, 1.0)
         top = s.height_m if s.box_m is None else 2.45
@@ -203,7 +204,7 @@ def _stations(shape: _Shape) -> F64:
     s = shape.spec
     x = [np.linspace(shape.nose_x, shape.end_x, max(int((shape.nose_x - shape.end_x) / 0.09), 12))]
     for axle in (shape.front_x, shape.rear_x):
-        x.append(axle + shape.arch_m * np.cos(np.linspace(0.0, np.pi, 19)))
+        x.append(axle + shape.arch_m * sm.cos(np.linspace(0.0, np.pi, 19)))
     edges = [s.cowl_m, s.cowl_m + 0.05, s.screen_top_m, s.screen_top_m - 0.05, s.roof_end_m, s.back_base_m]
     edges += [s.roof_end_m + 0.04, s.back_base_m - 0.04, s.side_glass_end_m, _first_pane(s), s.belt_m * 0 + s.cowl_m]
     edges += [p + d for p in s.pillars_m for d in (-0.045, 0.045)]
@@ -305,7 +306,7 @@ def _add_underside(skin: _Skin, shape: _Shape, x: F64) -> None:
     for axle in (shape.front_x, shape.rear_x):
         if axle < shape.end_x:
             continue
-        wx, wz = axle + shape.arch_m * np.cos(angle), s.tyre_radius_m + shape.arch_m * np.sin(angle)
+        wx, wz = axle + shape.arch_m * sm.cos(angle), s.tyre_radius_m + shape.arch_m * sm.sin(angle)
         outer = shape.half_width(wx, wz)
         housing = np.stack([np.stack([wx, y, wz], axis=1) for y in (outer, np.full(len(wx), inner))], axis=1)
         _mirrored(skin, housing, OTHER)
@@ -340,7 +341,7 @@ def _add_inside(skin: _Skin, shape: _Shape) -> None:
     skin.patch(_wall(cabin_end, inner, floor, float(shape.belt(np.array([cabin_end]))[0]) - 0.05), OTHER)
     wheel_x, wheel_y, wheel_z = cowl - 0.42, half * 0.5, s.belt_m - 0.12
     ring = np.linspace(0.0, 2.0 * np.pi, 13)
-    rims = [np.stack([wheel_x - 0.3 * r * np.sin(ring), wheel_y + r * np.cos(ring), wheel_z + r * np.sin(ring)], 1)
+    rims = [np.stack([wheel_x - 0.3 * r * sm.sin(ring), wheel_y + r * sm.cos(ring), wheel_z + r * sm.sin(ring)], 1)
             for r in (0.15, 0.18)]  # fmt: skip
     skin.patch(np.stack(rims, axis=1), OTHER)
 
@@ -402,9 +403,9 @@ def _add_wheel(skin: _Skin, shape: _Shape, axle: float, side: float) -> None:
     y = side * (out - np.array([o[1] for o in outline]))
     grid = np.stack(
         [
-            axle + r[None, :] * np.cos(angle)[:, None],
+            axle + r[None, :] * sm.cos(angle)[:, None],
             np.broadcast_to(y[None, :], (len(angle), len(r))),
-            radius + r[None, :] * np.sin(angle)[:, None],
+            radius + r[None, :] * sm.sin(angle)[:, None],
         ],
         axis=2,
     )

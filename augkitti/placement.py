@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from augkitti import same_math as sm
 from augkitti.config import Config, PlacementConfig
 from augkitti.drivable import is_drivable
 from augkitti.frames import (
@@ -168,7 +169,7 @@ def clear_of_seam(scene: PlacementScene, car: VirtualCar) -> bool:
     times = np.linspace(car.moment0_s, scene.interval_s + car.moment1_s, 7)
     T_scanner_car = compose(invert(T_world_scanner(scene.twist, times)), T_world_car(car, times))
     corners = transform_points(T_scanner_car[:, None], _corners(car.model))
-    from_behind = wrap_angle(np.arctan2(corners[..., 1], corners[..., 0]) - np.pi)
+    from_behind = wrap_angle(sm.arctan2(corners[..., 1], corners[..., 0]) - np.pi)
     nearest = float(np.abs(from_behind).min())
     straddles = (
         (from_behind.max(axis=1) > 0) & (from_behind.min(axis=1) < 0) & (np.ptp(from_behind, axis=1) < np.pi)
@@ -219,7 +220,7 @@ def _drivable_cells(region: DrivableRegion, config: PlacementConfig) -> tuple[F6
     """Drivable cells (C, 2) within range and the road's heading (C,) at each."""
     cells = np.argwhere(region.drivable)
     xy = (cells + 0.5) * region.cell_m + np.asarray(region.origin_m)
-    r = np.hypot(xy[:, 0], xy[:, 1])
+    r = sm.hypot(xy[:, 0], xy[:, 1])
     use = (r >= config.min_range_m) & (r <= config.max_range_m)
     return xy[use], _road_headings(region, cells[use])
 
@@ -246,19 +247,19 @@ def _road_headings(region: DrivableRegion, cells: Array) -> F64:
     uv = mean(area * u * v) / total - mu * mv
     spread = np.maximum(uu + vv, 1e-9)
     ego = region.road_heading_rad
-    cosine = (uu - vv) / spread + _EGO_ROAD_WEIGHT * np.cos(2.0 * ego)
-    sine = 2.0 * uv / spread + _EGO_ROAD_WEIGHT * np.sin(2.0 * ego)
-    bend = 0.5 * np.asarray(wrap_angle(np.arctan2(sine, cosine) - 2.0 * ego), dtype=np.float64)
-    is_street = (np.abs(bend) < _LARGEST_BEND_RAD) | (np.hypot(uu - vv, 2.0 * uv) / spread > _LEAST_LONG)
+    cosine = (uu - vv) / spread + _EGO_ROAD_WEIGHT * sm.cos(2.0 * ego)
+    sine = 2.0 * uv / spread + _EGO_ROAD_WEIGHT * sm.sin(2.0 * ego)
+    bend = 0.5 * np.asarray(wrap_angle(sm.arctan2(sine, cosine) - 2.0 * ego), dtype=np.float64)
+    is_street = (np.abs(bend) < _LARGEST_BEND_RAD) | (sm.hypot(uu - vv, 2.0 * uv) / spread > _LEAST_LONG)
     return ego + np.where(is_street, bend, 0.0)
 
 
 def _cell_chances(xy: F64, heading_rad: F64, road_heading_rad: float, config: PlacementConfig) -> dict[str, F64]:
     """Cumulated weights: distances evenly over where there is room, fewer on the wrong side and in side streets."""
-    ring = np.floor(np.hypot(xy[:, 0], xy[:, 1]) / 2.0).astype(np.int64)
+    ring = np.floor(sm.hypot(xy[:, 0], xy[:, 1]) / 2.0).astype(np.int64)
     even = 1.0 / np.maximum(np.bincount(ring), 25)[ring] if len(xy) else np.zeros(0)
     on_ego_road = np.abs(heading_rad - road_heading_rad) < _LARGEST_BEND_RAD
-    left = xy[:, 1] * np.cos(road_heading_rad) - xy[:, 0] * np.sin(road_heading_rad)
+    left = xy[:, 1] * sm.cos(road_heading_rad) - xy[:, 0] * sm.sin(road_heading_rad)
     anywhere = np.cumsum(even)
     return {
         "along": np.cumsum(
@@ -285,7 +286,7 @@ def _likely_places(
     road = scene.scans[0].prepared.region.road_heading_rad if crossing else scene.cell_heading_rad[cell]
     yaw = np.full(len(xy), drive.heading_rad) + road
     if scene.raw:
-        behind = np.abs(wrap_angle(np.arctan2(xy[:, 1], xy[:, 0]) - np.pi))
+        behind = np.abs(wrap_angle(sm.arctan2(xy[:, 1], xy[:, 0]) - np.pi))
         xy, yaw = xy[behind > SEAM_RAD], yaw[behind > SEAM_RAD]
     inside = _footprint_drivable(scene.scans[0].prepared, model, xy, yaw)
     xy, yaw = xy[inside], yaw[inside]
@@ -302,7 +303,7 @@ def _planar_at_scan1(scene: PlacementScene, model: CarModel, drive: Drive, xy: F
     T_world_then = T_world_scanner(scene.twist, moment0)
     z = height_at(scene.scans[0].prepared.ground, xy)
     xyz_world = transform_points(T_world_then, np.column_stack([xy, z]))
-    yaw_world = yaw + np.arctan2(T_world_then[:, 1, 0], T_world_then[:, 0, 0])
+    yaw_world = yaw + sm.arctan2(T_world_then[:, 1, 0], T_world_then[:, 0, 0])
     moment1 = moment0
     for _ in range(3):  # the bearing hardly moves within the correction: 1e-4 s after three rounds
         elapsed = scene.interval_s + moment1 - moment0
@@ -310,14 +311,14 @@ def _planar_at_scan1(scene: PlacementScene, model: CarModel, drive: Drive, xy: F
         T_scanner_world = invert(T_world_scanner(scene.twist, scene.interval_s + moment1))
         xy1 = transform_points(T_scanner_world, np.column_stack([xy_world, xyz_world[:, 2]]))[:, :2]
         moment1 = _moments(scene, 1, xy1)
-    return xy1, yaw1_world + np.arctan2(T_scanner_world[:, 1, 0], T_scanner_world[:, 0, 0])
+    return xy1, yaw1_world + sm.arctan2(T_scanner_world[:, 1, 0], T_scanner_world[:, 0, 0])
 
 
 def _moments(scene: PlacementScene, k: int, xy: F64) -> F64:
     """When (M,) seconds from scan k's middle its azimuth passes places (M, 2)."""
     if not scene.raw:
         return np.zeros(len(xy))
-    share = wrap_angle(np.arctan2(xy[:, 1], xy[:, 0])) / (2.0 * np.pi)  # `azimuth_time` of many
+    share = wrap_angle(sm.arctan2(xy[:, 1], xy[:, 0])) / (2.0 * np.pi)  # `azimuth_time` of many
     return np.asarray(-share * scene.scans[k].prepared.scan.period_s, dtype=np.float64)
 
 
@@ -328,7 +329,7 @@ def _footprint_drivable(prepared: PreparedScan, model: CarModel, xy: F64, yaw: F
     along = np.linspace(-0.5, 0.5, int(np.ceil(length / spacing)) + 1) * length
     across = np.linspace(-0.5, 0.5, int(np.ceil(width / spacing)) + 1) * width
     grid = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
-    c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    c, s = sm.cos(yaw)[:, None], sm.sin(yaw)[:, None]
     x = xy[:, :1] + c * grid[:, 0] - s * grid[:, 1]
     y = xy[:, 1:] + s * grid[:, 0] + c * grid[:, 1]
     inside = is_drivable(prepared.region, np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(x.shape)
@@ -352,7 +353,7 @@ def _stand(
         pose1 = compose(invert(T_world_scanner(scene.twist, scene.interval_s + moment1)), T_world_car1)
         before = moment1
         if scene.raw:
-            moment1 = azimuth_time(float(np.arctan2(pose1[1, 3], pose1[0, 3])), scene.scans[1].prepared.scan.period_s)
+            moment1 = azimuth_time(float(sm.arctan2(pose1[1, 3], pose1[0, 3])), scene.scans[1].prepared.scan.period_s)
         if abs(moment1 - before) < 1e-9:
             break
     on_ground = _pose_on_ground(scene, 1, model, pose1[:2, 3], yaw_of(pose1), moment1, config)
@@ -395,7 +396,7 @@ def _pose_on_ground(
     and a moving one does not shake; the caller sees to it that neither map is left by more than `ground_gap_m`.
     """
     wheels = wheel_contacts(model)
-    c, s = np.cos(yaw), np.sin(yaw)
+    c, s = sm.cos(yaw), sm.sin(yaw)
     at = xy + np.stack([c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=1)
     here, there = scene.scans[k], scene.scans[1 - k]
     if not _is_observed(here.prepared.ground, at).any():  # far out beams lie farther apart than axles
@@ -413,7 +414,7 @@ def _pose_on_ground(
     height = height + 0.5 * (height_at(there.prepared.ground, other[:, :2]) - other[:, 2])
     along = (height[0] + height[1] - height[2] - height[3]) / (2.0 * model.wheelbase_m)
     across = (height[0] + height[2] - height[1] - height[3]) / (4.0 * wheels[0, 1])
-    if np.hypot(along, across) > _STEEPEST:
+    if sm.hypot(along, across) > _STEEPEST:
         return None
     normal = np.array([-along * c + across * s, -along * s - across * c, 1.0])
     normal /= np.sqrt((normal * normal).sum())
@@ -451,7 +452,7 @@ def _clear_of_points(scene: PlacementScene, scan: SceneScan, car: VirtualCar, k:
     middle = transform_points(
         invert(T_world_scanner(scene.twist, scan.middle_s)), 0.5 * (T_world[0, :3, 3] + T_world[-1, :3, 3])
     )
-    half_turn = 0.5 * scan.prepared.scan.period_s * float(np.abs(scene.twist[3:]).max()) * float(np.hypot(*middle[:2]))
+    half_turn = 0.5 * scan.prepared.scan.period_s * float(np.abs(scene.twist[3:]).max()) * float(sm.hypot(*middle[:2]))
     near = _within(scan.xyz, middle, reach + 0.5 * way + 0.5 + 2.0 * ego_way + half_turn)
     xyz_world = transform_points(T_world_scanner(scene.twist, scan.time_s[near]), scan.xyz[near])
     return not _any_in_car(transform_points(invert(T_world)[:, None], xyz_world), car.model, config)
@@ -474,15 +475,15 @@ def _free_rays(scan: SceneScan, car: VirtualCar, k: int, config: Config) -> bool
     """Whether enough of the rays towards the car's box reach it."""
     pose = car.pose1 if k else car.pose0
     corners = transform_points(pose, _corners(car.model))
-    bearing = float(np.arctan2(pose[1, 3], pose[0, 3]))
-    offset = wrap_angle(np.arctan2(corners[:, 1], corners[:, 0]) - bearing)
+    bearing = float(sm.arctan2(pose[1, 3], pose[0, 3]))
+    offset = wrap_angle(sm.arctan2(corners[:, 1], corners[:, 0]) - bearing)
     centre = (bearing + np.pi) / (2.0 * np.pi) * _AZIMUTH_BINS
     bins = _AZIMUTH_BINS / (2.0 * np.pi)
     first, last = int(np.ceil(centre + offset.min() * bins)), int(np.floor(centre + offset.max() * bins))
-    distance = float(np.hypot(pose[0, 3], pose[1, 3]))
+    distance = float(sm.hypot(pose[0, 3], pose[1, 3]))
     low, high = float(corners[:, 2].min()), float(corners[:, 2].max())
-    rings = (scan.ring_elevation_rad > np.arctan2(low + 0.1, distance)) & (
-        scan.ring_elevation_rad < np.arctan2(high - 0.3, distance)
+    rings = (scan.ring_elevation_rad > sm.arctan2(low + 0.1, distance)) & (
+        scan.ring_elevation_rad < sm.arctan2(high - 0.3, distance)
     )
     toward = scan.farthest_m[rings][:, np.arange(first, last + 1) % _AZIMUTH_BINS]
     free = toward > float(np.sqrt((corners * corners).sum(axis=1)).min())
@@ -527,7 +528,7 @@ def _label_quads(pair: ScanPair, twist: F64, times: F64, rolling: bool, gap_m: f
     def in_world(label: LabelledBox, middle_s: float, period_s: float) -> tuple[float, F64]:
         t = middle_s
         if rolling:
-            t += azimuth_time(float(np.arctan2(label.box[1], label.box[0])), period_s)
+            t += azimuth_time(float(sm.arctan2(label.box[1], label.box[0])), period_s)
         return t, compose(T_world_scanner(twist, t), _planar_pose(label.box))
 
     quads = []
@@ -543,7 +544,7 @@ def _label_quads(pair: ScanPair, twist: F64, times: F64, rolling: bool, gap_m: f
 
 
 def _planar_pose(box: F64) -> F64:
-    c, s = np.cos(box[6]), np.sin(box[6])
+    c, s = sm.cos(box[6]), sm.sin(box[6])
     return np.array([[c, -s, 0.0, box[0]], [s, c, 0.0, box[1]], [0.0, 0.0, 1.0, box[2]], [0.0, 0.0, 0.0, 1.0]])
 
 

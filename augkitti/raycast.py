@@ -13,6 +13,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
+from augkitti import same_math as sm
 from augkitti.frames import F64, Array, invert, rotate_vectors, transform_points, wrap_angle
 from augkitti.scan_pair import GLASS, I32, MEASURED, U8, CarModel, ScanRays
 from augkitti.scanner import ScannerProfile, ray_lines
@@ -74,17 +75,17 @@ def rays_near(rays: ScanRays, T_velo_car: F64, size_m: Array, grow_m: float) -> 
     half = np.asarray(size_m, dtype=np.float64) / 2.0 + grow_m
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.float64)
     corners = transform_points(T_velo_car, signs * half)
-    distance = np.hypot(corners[:, 0], corners[:, 1])
+    distance = sm.hypot(corners[:, 0], corners[:, 1])
     centre = T_velo_car[:2, 3]
-    bearing = float(np.arctan2(centre[1], centre[0]))
-    off = wrap_angle(np.arctan2(corners[:, 1], corners[:, 0]) - bearing)
+    bearing = float(sm.arctan2(centre[1], centre[0]))
+    off = wrap_angle(sm.arctan2(corners[:, 1], corners[:, 0]) - bearing)
     near = float(np.abs(transform_points(invert(T_velo_car), np.zeros(3))[:2] / half[:2]).max())
     if near <= 1.0:  # the scanner stands over the box
         return np.arange(len(rays), dtype=np.int32)
     # Nearest approach of the footprint, not of its corners: a long side can come closer than both its ends.
-    closest = max(float(np.hypot(*centre)) - float(np.hypot(half[0], half[1])), 0.5)
-    low = np.arctan2(corners[:, 2].min() - 0.25, np.where(corners[:, 2].min() < 0.25, closest, distance.max()))
-    high = np.arctan2(corners[:, 2].max() - 0.1, np.where(corners[:, 2].max() > 0.1, closest, distance.max()))
+    closest = max(float(sm.hypot(*centre)) - float(sm.hypot(half[0], half[1])), 0.5)
+    low = sm.arctan2(corners[:, 2].min() - 0.25, np.where(corners[:, 2].min() < 0.25, closest, distance.max()))
+    high = sm.arctan2(corners[:, 2].max() - 0.1, np.where(corners[:, 2].max() > 0.1, closest, distance.max()))
     margin = 0.03 / closest + 1e-3  # beams do not start at the frame's origin
     from_rad, to_rad = bearing + float(off.min()) - margin, bearing + float(off.max()) + margin
     azimuth = rays.ray_azimuth_rad  # in [-pi, pi): a window over the cut behind is two

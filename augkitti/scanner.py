@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import F64, wrap_angle
 from augkitti.scan_pair import I32, NO_TICK, U8, U16, Bool, Scan, ScanRays
@@ -148,8 +149,8 @@ def profile_from_content(content: Any, where: str) -> ScannerProfile:
 
 def ray_lines(profile: ScannerProfile, ring: U8, azimuth_rad: F64, elevation_rad: F64) -> tuple[F64, F64]:
     """Origins (R, 3) metres and unit directions (R, 3) of rays, velo frame at each ray's own firing."""
-    cos_a, sin_a = np.cos(azimuth_rad), np.sin(azimuth_rad)
-    cos_e, sin_e = np.cos(elevation_rad), np.sin(elevation_rad)
+    cos_a, sin_a = sm.cos(azimuth_rad), sm.sin(azimuth_rad)
+    cos_e, sin_e = sm.cos(elevation_rad), sm.sin(elevation_rad)
     side = profile.side_m[ring]
     origin = np.stack([-side * sin_a, side * cos_a, profile.height_m[ring]], axis=-1)
     direction = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
@@ -255,10 +256,10 @@ def ray_distance(scan: Scan, rays: ScanRays, profile: ScannerProfile) -> F64:
 
 def _rings_by_run(xyz: F64, profile: ScannerProfile) -> U8:
     """Ring of each point by its run of rising azimuth; a run is named by the beam that it fits best."""
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]) % (2.0 * np.pi)
+    azimuth = sm.arctan2(xyz[:, 1], xyz[:, 0]) % (2.0 * np.pi)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(azimuth) < -np.pi) + 1, [len(xyz)]])
-    tan_e, height = np.tan(profile.elevation_rad), profile.height_m
-    rho = np.hypot(xyz[:, 0], xyz[:, 1])
+    tan_e, height = sm.tan(profile.elevation_rad), profile.height_m
+    rho = sm.hypot(xyz[:, 0], xyz[:, 1])
     rings = np.zeros(len(starts) - 1, dtype=np.uint8)
     for run in range(len(rings)):
         points = np.arange(starts[run], starts[run + 1])
@@ -270,26 +271,26 @@ def _rings_by_run(xyz: F64, profile: ScannerProfile) -> U8:
 
 def _line_through(xyz: F64, ring: U8, profile: ScannerProfile) -> tuple[F64, F64]:
     """Azimuth and elevation of the ray from each beam's origin through each point."""
-    rho = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), 1e-6)
+    rho = np.maximum(sm.hypot(xyz[:, 0], xyz[:, 1]), 1e-6)
     side = profile.side_m[ring]
-    azimuth = wrap_angle(np.arctan2(xyz[:, 1], xyz[:, 0]) - np.arcsin(np.clip(side / rho, -1.0, 1.0)))
+    azimuth = wrap_angle(sm.arctan2(xyz[:, 1], xyz[:, 0]) - sm.arcsin(np.clip(side / rho, -1.0, 1.0)))
     along = np.sqrt(np.maximum(rho * rho - side * side, 1e-12))
-    return np.asarray(azimuth), np.asarray(np.arctan2(xyz[:, 2] - profile.height_m[ring], along))
+    return np.asarray(azimuth), np.asarray(sm.arctan2(xyz[:, 2] - profile.height_m[ring], along))
 
 
 def _nearest_tick(xyz: F64, ring: U8, profile: ScannerProfile) -> tuple[npt.NDArray[np.int64], F64]:
     """Nearest tick (N,) of each point on its ring and the distance (N,) metres from that ray."""
-    rho = np.hypot(xyz[:, 0], xyz[:, 1])
+    rho = sm.hypot(xyz[:, 0], xyz[:, 1])
     side = profile.side_m[ring]
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]) - np.arcsin(np.clip(side / np.maximum(rho, 1e-6), -1.0, 1.0))
+    azimuth = sm.arctan2(xyz[:, 1], xyz[:, 0]) - sm.arcsin(np.clip(side / np.maximum(rho, 1e-6), -1.0, 1.0))
     along = np.sqrt(np.maximum(rho * rho - side * side, 0.0))
     ticks = (azimuth - profile.azimuth_rad[ring]) / profile.tick_step_rad
     nearest = np.rint(ticks)
     across = along * (ticks - nearest) * profile.tick_step_rad
     elevation = profile.elevation_rad[ring]
-    above = np.cos(elevation) * (xyz[:, 2] - profile.height_m[ring]) - np.sin(elevation) * along
+    above = sm.cos(elevation) * (xyz[:, 2] - profile.height_m[ring]) - sm.sin(elevation) * along
     tick = (nearest.astype(np.int64) - profile.tick_offset[ring]) % profile.lattice_size
-    return tick, np.hypot(across, above)
+    return tick, sm.hypot(across, above)
 
 
 def _best_ring(xyz: F64, profile: ScannerProfile) -> tuple[U8, npt.NDArray[np.int64], F64]:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.signal import lfilter
 from scipy.special import expit, ndtr, ndtri
 
+from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import F64
 from augkitti.raycast import CarHits
@@ -157,7 +158,7 @@ def simulate_returns(
         pane = here & (surface == GLASS) & (not opaque_glass)
         luck = np.where(panes == 0, pane_luck, inside_luck)
         passes = np.where(panes == 0, model.glass.pass_, model.glass.second_pass) * 2.0 * clear
-        passes = np.clip(passes * cosine**model.glass.cosine, 0.0, 1.0 - model.glass.reflect)
+        passes = np.clip(passes * sm.power(cosine, model.glass.cosine), 0.0, 1.0 - model.glass.reflect)
         reflects = np.where(panes == 0, model.glass.reflect, 0.5 * model.glass.reflect)
         shines_back = pane & (luck < reflects)
         goes_on = pane & (luck > 1.0 - passes)
@@ -176,7 +177,7 @@ def simulate_returns(
     surface[(panes > 0) & (layer_of_stop > 0)] = THROUGH_GLASS
     cosine = np.maximum(hits.cos_incidence[rows, last], 0.1)
     true_m = np.where(np.isfinite(stop), stop, 0.0)
-    noise = shot * np.hypot(model.shot_std_m, np.where(surface == THROUGH_GLASS, 0.0, model.grazing_std_m / cosine))
+    noise = shot * sm.hypot(model.shot_std_m, np.where(surface == THROUGH_GLASS, 0.0, model.grazing_std_m / cosine))
     measured = quantise_range(true_m + profile.range_bias_m[ring] + noise, ring, profile)
     returned &= (measured >= profile.min_range_m) & (measured <= profile.max_range_m)
     return CarReturns(stop, returned, measured, _reflectance(surface, shine, look, model, profile), surface)
@@ -220,7 +221,7 @@ class _FieldGrid:
         self.empty = len(ring) == 0
         if self.empty:
             return
-        middle = float(np.arctan2(np.sin(azimuth_rad).sum(), np.cos(azimuth_rad).sum()))
+        middle = float(sm.arctan2(sm.sin(azimuth_rad).sum(), sm.cos(azimuth_rad).sum()))
         off = (azimuth_rad - middle + np.pi) % (2.0 * np.pi) - np.pi
         column = np.rint(off * (_FIRINGS / (2.0 * np.pi))).astype(np.int64)
         self.row = ring.astype(np.int64) - int(ring.min())

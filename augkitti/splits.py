@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from augkitti import same_math as sm
 from augkitti.dataset_index import (
     SPLITS_NAME,
     DatasetIndex,
@@ -275,7 +276,7 @@ def _search(
 ) -> tuple[float, npt.NDArray[np.int64]]:
     """Largest first into the split that lacks most, then moves and swaps while they help."""
     splits = len(target)
-    jitter = pairs * np.exp(rng.normal(0.0, 0.3, len(pairs)))
+    jitter = pairs * sm.exp(rng.normal(0.0, 0.3, len(pairs)))
     chosen = np.zeros(len(pairs), dtype=np.int64)
     lacks = target.astype(np.float64).copy()
     for nth, i in enumerate(np.argsort(-jitter, kind="stable")):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from augkitti import same_math as sm
 from augkitti import street_objects as objects
 from augkitti.frames import F64, Array, footprints_overlap
 from augkitti.parametric_cars import parametric_cars
@@ -125,21 +126,21 @@ def world_points(shape: Shape, s_m: Array, n_m: Array) -> F64:
     """World coordinates (..., 3) of the ground at (s, n)."""
     s, n = np.broadcast_arrays(np.asarray(s_m, dtype=np.float64), np.asarray(n_m, dtype=np.float64))
     heading = road_heading(shape, s)
-    x = np.interp(s, shape.s_m, shape.xy_m[:, 0]) - n * np.sin(heading)
-    y = np.interp(s, shape.s_m, shape.xy_m[:, 1]) + n * np.cos(heading)
+    x = np.interp(s, shape.s_m, shape.xy_m[:, 0]) - n * sm.sin(heading)
+    y = np.interp(s, shape.s_m, shape.xy_m[:, 1]) + n * sm.cos(heading)
     return np.stack([x, y, surface_height(shape, s, n)], axis=-1)
 
 
 def road_heading(shape: Shape, s_m: Array) -> F64:
     """Heading (radians) of the centre line."""
-    return np.asarray(shape.bend_rad * np.sin(2.0 * np.pi * np.asarray(s_m) / shape.wave_m + shape.phase_rad))
+    return np.asarray(shape.bend_rad * sm.sin(2.0 * np.pi * np.asarray(s_m) / shape.wave_m + shape.phase_rad))
 
 
 def surface_height(shape: Shape, s_m: Array, n_m: Array) -> F64:
     """Height (...,) metres of the ground: crowned carriageways, kerbs, pavements, banks."""
     s, n = np.asarray(s_m, dtype=np.float64), np.asarray(n_m, dtype=np.float64)
     k = 2.0 * np.pi / shape.slope_wave_m
-    along = shape.slope / k * (np.sin(k * s + shape.slope_phase_rad) - np.sin(shape.slope_phase_rad))
+    along = shape.slope / k * (sm.sin(k * s + shape.slope_phase_rad) - sm.sin(shape.slope_phase_rad))
     beyond = _beyond_kerb(shape, n)
     left = n > 0.0
     half = np.where(left, shape.half_m[0], shape.half_m[1])
@@ -150,7 +151,7 @@ def surface_height(shape: Shape, s_m: Array, n_m: Array) -> F64:
     land = 0.02 * np.minimum(q, pavement) + bank * _smooth((q - pavement - 0.5) / 12.0)
     garden = _smooth((q - pavement - 0.3) / 2.0) * _smooth((off_side - 0.5) / 2.0)
     for height, along_k, across_k, phase in shape.bumps:
-        land = land + garden * height * np.sin(along_k * s + across_k * n + phase)
+        land = land + garden * height * sm.sin(along_k * s + across_k * n + phase)
     lowered = np.where(left, _lowered(shape.driveways_m[0], s), _lowered(shape.driveways_m[1], s))
     kerb = shape.kerb_m * (1.0 - 0.75 * lowered * (1.0 - _smooth(q / 1.5)))
     raised = np.where(side, 0.0, kerb)
@@ -225,7 +226,7 @@ def _net_lines(shape: Shape) -> tuple[F64, F64]:
     lines = [np.zeros(1)]
     for sign, half, pavement in zip((1.0, -1.0), shape.half_m, shape.pavement_m, strict=True):
         q = np.concatenate([[0.0, _KERB_FACE_M, 0.12, 0.3], np.arange(0.6, 5.0, 0.4), [pavement, pavement + 0.05]])
-        far = 5.0 + 0.8 * np.cumsum(1.12 ** np.arange(24))
+        far = 5.0 + 0.8 * np.cumsum(sm.exp(sm.log(1.12) * np.arange(24)))
         lines.append(sign * (half + np.concatenate([q, far[far < _ASIDE_M - half]])))
         lines.append(sign * np.arange(0.8, half - 0.3, 0.8))
     return _apart(np.concatenate(s_lines)), _apart(np.concatenate(lines))
@@ -276,7 +277,7 @@ def make_track(
     along = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(xyz[:, :2], axis=0) ** 2).sum(axis=1)))])
     direction = np.gradient(xyz[:, :2], axis=0)
     direction /= np.maximum(np.sqrt((direction**2).sum(axis=1, keepdims=True)), 1e-12)
-    yaw = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
+    yaw = np.unwrap(sm.arctan2(direction[:, 1], direction[:, 0]))
     leg = np.gradient(sn, axis=0)
     leg /= np.maximum(np.sqrt((leg**2).sum(axis=1, keepdims=True)), 1e-12)
     ahead = sn + wheelbase_m * leg
@@ -300,9 +301,9 @@ def track_poses(track: Track, time_s: Array) -> F64:
     position = np.stack([np.interp(along, track.along_m, track.position_m[:, i]) for i in range(3)], axis=-1)
     normal = np.stack([np.interp(along, track.along_m, track.normal[:, i]) for i in range(3)], axis=-1)
     yaw = np.interp(along, track.along_m, track.yaw_rad)
-    c, s = np.cos(yaw), np.sin(yaw)
-    pitch = track.sway_rad * np.sin(2.0 * np.pi * 1.4 * t + track.sway_phase)
-    roll = track.sway_rad * np.sin(2.0 * np.pi * 0.9 * t + 2.0 * track.sway_phase)
+    c, s = sm.cos(yaw), sm.sin(yaw)
+    pitch = track.sway_rad * sm.sin(2.0 * np.pi * 1.4 * t + track.sway_phase)
+    roll = track.sway_rad * sm.sin(2.0 * np.pi * 0.9 * t + 2.0 * track.sway_phase)
     normal = normal + np.stack([pitch * c - roll * s, pitch * s + roll * c, np.zeros_like(c)], axis=-1)
     normal = normal / np.sqrt((normal**2).sum(axis=-1, keepdims=True))
     forward = np.stack([c, s, -(normal[..., 0] * c + normal[..., 1] * s) / normal[..., 2]], axis=-1)
@@ -333,15 +334,15 @@ def _rounded(corners: F64, radius_m: float) -> F64:
     for i in range(1, len(corners) - 1):
         a, b = corners[i] - corners[i - 1], corners[i + 1] - corners[i]
         a, b = a / np.sqrt((a * a).sum()), b / np.sqrt((b * b).sum())
-        turn = np.arctan2(a[0] * b[1] - a[1] * b[0], (a * b).sum())
+        turn = sm.arctan2(a[0] * b[1] - a[1] * b[0], (a * b).sum())
         if abs(turn) < 1e-6:
             continue
-        cut = radius_m * np.tan(0.5 * abs(turn))
+        cut = radius_m * sm.tan(0.5 * abs(turn))
         begin = corners[i] - cut * a
         pieces.append(_leg(here, begin))
         angle = np.linspace(0.0, turn, max(2, int(abs(turn) * radius_m / _PATH_STEP_M)))[:-1]
         side = np.sign(turn) * np.array([-a[1], a[0]])
-        pieces.append(begin + radius_m * (np.sin(np.abs(angle))[:, None] * a + (1 - np.cos(angle))[:, None] * side))
+        pieces.append(begin + radius_m * (sm.sin(np.abs(angle))[:, None] * a + (1 - sm.cos(angle))[:, None] * side))
         here = corners[i] + cut * b
     pieces.append(np.concatenate([_leg(here, corners[-1]), corners[-1:]]))
     return np.concatenate(pieces)
@@ -399,10 +400,10 @@ def _draw_shape(rng: np.random.Generator, travel_m: float, turns_off: bool) -> S
     bend, wave = float(rng.uniform(0.05, 0.4)), float(rng.uniform(240.0, 420.0))
     phase = float(rng.uniform(0.0, 2.0 * np.pi))
     s = np.arange(-_BEYOND_M - 10.0, travel_m + _BEYOND_M + 10.0, 0.25)
-    heading = bend * np.sin(2.0 * np.pi * s / wave + phase)
+    heading = bend * sm.sin(2.0 * np.pi * s / wave + phase)
     step = 0.5 * (heading[1:] + heading[:-1])
     xy = np.zeros((len(s), 2))
-    xy[1:, 0], xy[1:, 1] = np.cumsum(0.25 * np.cos(step)), np.cumsum(0.25 * np.sin(step))
+    xy[1:, 0], xy[1:, 1] = np.cumsum(0.25 * sm.cos(step)), np.cumsum(0.25 * sm.sin(step))
     xy -= [np.interp(0.0, s, xy[:, 0]), np.interp(0.0, s, xy[:, 1])]
     return Shape(
         bend_rad=bend,
@@ -455,9 +456,9 @@ def _stand(
 ) -> Mesh:
     """A thing at (s, n), turned against the street; a long one stands as low as the ground at its far corner."""
     yaw = float(road_heading(shape, np.array(s))) + turn_rad
-    c, sn = np.cos(yaw), np.sin(yaw)
+    c, sn = sm.cos(yaw), sm.sin(yaw)
     x, y, z = world_points(shape, np.array(s), np.array(n))
-    ct, st = np.cos(turn_rad), np.sin(turn_rad)
+    ct, st = sm.cos(turn_rad), sm.sin(turn_rad)
     far = [(s + ct * a - st * b, n + st * a + ct * b) for a in (0.0, reach[0]) for b in (0.0, reach[1])]
     z = min(float(surface_height(shape, np.array(p), np.array(q))) for p, q in far)
     return objects.placed(mesh, np.array([[c, -sn, 0, x], [sn, c, 0, y], [0, 0, 1, z], [0, 0, 0, 1]], dtype=np.float64))
@@ -753,8 +754,8 @@ def _body_footprints(body: Body, times: F64) -> F64:
 def _footprints(track: Track, times: F64, length_m: float, width_m: float, ahead_m: float) -> F64:
     """Corners (T, 4, 2) on the ground at times, grown by what drivers keep clear."""
     T = track_poses(track, times)
-    yaw = np.arctan2(T[:, 1, 0], T[:, 0, 0])
-    forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    yaw = sm.arctan2(T[:, 1, 0], T[:, 0, 0])
+    forward = np.stack([sm.cos(yaw), sm.sin(yaw)], axis=1)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     middle = T[:, :2, 3] + ahead_m * forward
     half_l, half_w = 0.5 * length_m + _CLEAR_M, 0.5 * width_m + _CLEAR_M

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from augkitti import same_math as sm
 from augkitti.frames import F64, Array, transform_points
 from augkitti.scan_pair import I32, OTHER, TYRE, U8, CarModel
 
@@ -63,7 +64,7 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float], mater
 def cylinder(radius_m: float, low_m: float, high_m: float, material: int, sides: int = 8, taper: float = 1.0) -> Mesh:
     """An upright pipe about the z axis; `taper` times as thick at its top."""
     turn = 2.0 * np.pi * np.arange(sides) / sides
-    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * radius_m
+    rim = np.stack([sm.cos(turn), sm.sin(turn)], axis=1) * radius_m
     low, high = np.insert(rim, 2, low_m, axis=1), np.insert(rim * taper, 2, high_m, axis=1)
     return quads(np.stack([low, np.roll(low, -1, 0), np.roll(high, -1, 0), high], axis=1), material)
 
@@ -72,7 +73,7 @@ def ellipsoid(centre: tuple[float, float, float], half: tuple[float, float, floa
     """An ellipsoid of 8 x 12 patches."""
     polar, turn = np.linspace(0.0, np.pi, 9), np.linspace(0.0, 2.0 * np.pi, 13)
     p, t = np.meshgrid(polar, turn, indexing="ij")
-    grid = np.stack([np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)], axis=-1) * half + centre
+    grid = np.stack([sm.sin(p) * sm.cos(t), sm.sin(p) * sm.sin(t), sm.cos(p)], axis=-1) * half + centre
     patches = np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2)
     return quads(patches.reshape(-1, 4, 3), material)
 
@@ -112,7 +113,7 @@ def hedge(length_m: float, rng: np.random.Generator) -> Mesh:
     height, thick = float(rng.uniform(0.8, 2.0)), float(rng.uniform(0.5, 1.0))
     count = int(60 * length_m * height)
     spots = rng.uniform([0.0, -0.5 * thick, 0.05], [length_m, 0.5 * thick, height], (count, 3))
-    spots[:, 2] *= 1.0 + 0.08 * np.sin(2.3 * spots[:, 0] + rng.uniform(0.0, 6.0)) + rng.normal(0.0, 0.04, count)
+    spots[:, 2] *= 1.0 + 0.08 * sm.sin(2.3 * spots[:, 0] + rng.uniform(0.0, 6.0)) + rng.normal(0.0, 0.04, count)
     face = rng.random(count)
     spots[face < 0.4, 1] = -0.5 * thick + rng.normal(0.0, 0.03, int((face < 0.4).sum()))
     spots[face > 0.7, 1] = 0.5 * thick + rng.normal(0.0, 0.03, int((face > 0.7).sum()))
@@ -162,7 +163,7 @@ def sign_post(rng: np.random.Generator) -> Mesh:
     """A traffic sign facing along the street."""
     height, half = float(rng.uniform(2.1, 2.8)), float(rng.uniform(0.25, 0.4))
     turn = 2.0 * np.pi * np.arange(4) / 4 + (np.pi / 4 if rng.random() < 0.5 else 0.0)
-    plate = np.stack([np.full(4, 0.05), half * np.cos(turn), height + half * np.sin(turn)], axis=1)
+    plate = np.stack([np.full(4, 0.05), half * sm.cos(turn), height + half * sm.sin(turn)], axis=1)
     return joined([cylinder(0.035, -0.2, height + half, METAL, 6), quads(plate[None], SIGN)])
 
 
@@ -225,7 +226,7 @@ def pedestrian_model(rng: np.random.Generator) -> CarModel:
 def cyclist_model(rng: np.random.Generator) -> CarModel:
     """Somebody on a bicycle."""
     lean = float(rng.uniform(0.1, 0.3))
-    wheel = np.stack([np.cos(np.linspace(0, 2 * np.pi, 15)), np.sin(np.linspace(0, 2 * np.pi, 15))], axis=1)
+    wheel = np.stack([sm.cos(np.linspace(0, 2 * np.pi, 15)), sm.sin(np.linspace(0, 2 * np.pi, 15))], axis=1)
     parts = [
         ellipsoid((0.15 + lean, 0.0, 1.68), (0.11, 0.1, 0.13), WOOD),
         ellipsoid((0.0, 0.0, 1.27), (0.16 + lean, 0.21, 0.3), WOOD),
@@ -259,7 +260,7 @@ def _as_model(name: str, category: str, mesh: Mesh) -> CarModel:
 
 
 def _turned(mesh: Mesh, yaw_rad: float, to: tuple[float, float]) -> Mesh:
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    c, s = sm.cos(yaw_rad), sm.sin(yaw_rad)
     return placed(mesh, np.array([[c, -s, 0, to[0]], [s, c, 0, to[1]], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64))
 
 

@@ -21,6 +21,7 @@ from scipy.ndimage import maximum_filter1d
 from scipy.signal import lfilter
 from scipy.special import expit, ndtr
 
+from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import (
     F32,
@@ -57,7 +58,7 @@ _START = datetime(2000, 1, 1, 12, 0, 1, tzinfo=UTC)
 _T_VELO_IMU = np.array([[1.0, 0, 0, -0.81], [0, 1.0, 0, 0.32], [0, 0, 1.0, -0.8], [0, 0, 0, 1.0]])
 _FRINGE_TICKS, _FRINGE_RETURN = 40, 0.5  # real scans: beams 44 to 63 lose 3 to 13 % of all rays beside the shadow
 _FOCAL, _CENTRE, _IMAGE = 720.0, (610.0, 172.0), (1242, 375)
-_CAMERA_AZIMUTH = (-float(np.arctan((_IMAGE[0] - _CENTRE[0]) / _FOCAL)), float(np.arctan(_CENTRE[0] / _FOCAL)))
+_CAMERA_AZIMUTH = (-float(sm.arctan((_IMAGE[0] - _CENTRE[0]) / _FOCAL)), float(sm.arctan(_CENTRE[0] / _FOCAL)))
 
 # A material a row, in the order of `street_objects`: mean reflectance, its spread, roughness along the ray (m),
 # share of pulses lost at any range.
@@ -207,7 +208,7 @@ def scan_street(
     boxes = np.zeros((len(street.bodies), 7))
     for index, body in enumerate(street.bodies):
         T_velo_body, boxes[index] = _at_its_moment(body, ego, frame)
-        if np.hypot(*boxes[index, :2]) > _SEE_M:
+        if sm.hypot(*boxes[index, :2]) > _SEE_M:
             continue
         drift = 0.3 + (body.track.speed_mps + 20.0) * period / 4.0 if body.moving else 0.3 + 20.0 * period / 4.0
         near = rays_near(rays, T_velo_body, body.model.size_m, drift)
@@ -234,7 +235,7 @@ def scan_street(
     kept = np.flatnonzero(
         returned & (distance >= profile.min_range_m) & (distance <= profile.max_range_m) & ~rays.ray_blind
     )
-    turn = np.arctan2(xyz[kept, 1], xyz[kept, 0]) % (2.0 * np.pi)
+    turn = sm.arctan2(xyz[kept, 1], xyz[kept, 0]) % (2.0 * np.pi)
     kept = kept[np.lexsort((turn, rays.ray_ring[kept]))]
     ground = _ground_truth(material[kept])
     moving = np.array([*(_moves(body, middle, period) for body in street.bodies), False])
@@ -280,7 +281,7 @@ def _at_its_moment(body: Body, ego: EgoTruth, frame: int) -> tuple[F64, F64]:
     for _ in range(6):
         time = np.array([middle + moment])
         T_velo_body = compose(invert(scanner_poses_at(ego, time)[0]), body_poses(body, time)[0])
-        moment = azimuth_time(float(np.arctan2(T_velo_body[1, 3], T_velo_body[0, 3])), period)
+        moment = azimuth_time(float(sm.arctan2(T_velo_body[1, 3], T_velo_body[0, 3])), period)
     return T_velo_body, np.array([*T_velo_body[:3, 3], *body.model.size_m, yaw_of(T_velo_body)])
 
 
@@ -302,11 +303,11 @@ def _still_returns(
     reach = np.where(hit, range_m, 1.0)
     shine = 0.9 * _along_ring(grid, 0.93, rng) + 0.43 * rng.standard_normal(len(rays))
     value = np.clip(table[:, 0] + table[:, 1] * shine, 0.005, 0.99)
-    echo = np.log(value * np.maximum(cosine, 0.01)) - 2.0 * np.log(reach / 40.0)
+    echo = sm.log(value * np.maximum(cosine, 0.01)) - 2.0 * sm.log(reach / 40.0)
     chance = (1.0 - table[:, 3]) * expit(2.5 * (echo + 6.0))
     chance = np.where(_shadow_fringe(profile)[rays.ray_ring, rays.ray_tick], _FRINGE_RETURN * chance, chance)
     luck = ndtr(0.8 * _along_ring(grid, 0.8, rng) + 0.6 * rng.standard_normal(len(rays)))
-    rough = np.hypot(0.008, table[:, 2] / np.maximum(cosine, 0.15))
+    rough = sm.hypot(0.008, table[:, 2] / np.maximum(cosine, 0.15))
     noise = np.minimum(rough, 0.15) * rng.standard_normal(len(rays))
     measured = quantise_range(reach + profile.range_bias_m[rays.ray_ring] + noise, rays.ray_ring, profile)
     steps = np.clip(np.rint(value / profile.reflectance_quantum), 0, 99)
@@ -416,8 +417,8 @@ def _write_oxts(folder: Path, street: Street, ego: EgoTruth, index: int, rng: np
     _text(folder / "timestamps.txt", "".join(_stamp(t) + "\n" for t in packet))
     _text(folder / "dataformat.txt", "".join(f"{column}\n" for column in _OXTS_COLUMNS))
     earth_m, lat0, lon0 = 6378137.0, 49.0 + 0.01 * index, 8.4
-    scale = float(np.cos(np.deg2rad(lat0)))
-    north0 = scale * earth_m * float(np.log(np.tan(np.deg2rad(90.0 + lat0) / 2.0)))
+    scale = float(sm.cos(np.deg2rad(lat0)))
+    north0 = scale * earth_m * float(sm.log(sm.tan(np.deg2rad(90.0 + lat0) / 2.0)))
     east0 = scale * earth_m * float(np.deg2rad(lon0))
     step = 0.01
     drift = np.cumsum(rng.normal(0.0, 0.01, (len(packet), 3)), axis=0)
@@ -427,16 +428,16 @@ def _write_oxts(folder: Path, street: Street, ego: EgoTruth, index: int, rng: np
         velocity = (position[2] - position[0]) / (2.0 * step) + rng.normal(0.0, 0.01, 3)
         acceleration = (position[2] - 2.0 * position[1] + position[0]) / step**2 + [0.0, 0.0, 9.81]
         rate = se3_log(compose(invert(T[0]), T[2]))[3:] / (2.0 * step) + rng.normal(0.0, 0.001, 3)
-        yaw = float(np.arctan2(R[1, 0], R[0, 0]))
-        pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
-        roll = float(np.arctan2(R[2, 1], R[2, 2]))
+        yaw = float(sm.arctan2(R[1, 0], R[0, 0]))
+        pitch = float(sm.arctan2(-R[2, 0], sm.hypot(R[0, 0], R[1, 0])))
+        roll = float(sm.arctan2(R[2, 1], R[2, 2]))
         roll, pitch, yaw = np.array([roll, pitch, yaw]) + rng.normal(0.0, 1e-4, 3)
         east, north, up = position[1] + drift[frame]
-        lat = float(np.rad2deg(2.0 * np.arctan(np.exp((north0 + north) / (scale * earth_m))))) - 90.0
+        lat = float(np.rad2deg(2.0 * sm.arctan(sm.exp((north0 + north) / (scale * earth_m))))) - 90.0
         lon = float(np.rad2deg((east0 + east) / (scale * earth_m)))
-        c, s = np.cos(yaw), np.sin(yaw)
+        c, s = sm.cos(yaw), sm.sin(yaw)
         forward, left = c * velocity[0] + s * velocity[1], -s * velocity[0] + c * velocity[1]
-        a, w = R.T @ acceleration, R @ rate
+        a, w = sm.product(R.T, acceleration), sm.product(R, rate)
         values = [
             lat,
             lon,
@@ -469,7 +470,7 @@ def _in_camera(box: F64) -> bool:
     corners = transform_points(
         box_pose(box), np.array([[i, j, 0.0] for i in (-0.5, 0.0, 0.5) for j in (-0.5, 0.5)]) * box[3:6]
     )
-    turn = np.arctan2(corners[:, 1], corners[:, 0])
+    turn = sm.arctan2(corners[:, 1], corners[:, 0])
     return bool(((turn >= _CAMERA_AZIMUTH[0]) & (turn <= _CAMERA_AZIMUTH[1])).any())
 
 
@@ -478,7 +479,7 @@ def _tracklets(street: Street, scans: list[tuple[F64, Array]]) -> str:
     items = []
     for index, body in enumerate(street.bodies):
         labelled = [
-            bool(seen[index]) and _in_camera(boxes[index]) and float(np.hypot(*boxes[index, :2])) <= _LABEL_M
+            bool(seen[index]) and _in_camera(boxes[index]) and float(sm.hypot(*boxes[index, :2])) <= _LABEL_M
             for boxes, seen in scans
         ]
         if not any(labelled):

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from augkitti import same_math as sm
 from augkitti.config import MotionConfig
 from augkitti.frames import F64
 
@@ -48,12 +49,12 @@ def draw_drive(wheelbase_m: float, must_move: bool, config: MotionConfig, rng: n
 def steering_limit(speed_mps: float, wheelbase_m: float, config: MotionConfig) -> float:
     """Largest steering angle (radians) at a speed: the wheels' own limit, or where lateral acceleration ends it."""
     gentlest = config.max_lateral_mps2 * wheelbase_m / max(speed_mps * speed_mps, 1e-9)
-    return float(min(config.max_steering_rad, np.arctan(gentlest)))
+    return float(min(config.max_steering_rad, sm.arctan(gentlest)))
 
 
 def bicycle_yaw_rate(speed_mps: float, steering_rad: float, wheelbase_m: float) -> float:
     """Yaw rate (radians per second) of the kinematic bicycle about its rear axle."""
-    return float(speed_mps * np.tan(steering_rad) / wheelbase_m)
+    return float(speed_mps * sm.tan(steering_rad) / wheelbase_m)
 
 
 def bicycle_twist(speed_mps: float, yaw_rate_rps: float, rear_axle_x_m: float) -> F64:
@@ -63,13 +64,13 @@ def bicycle_twist(speed_mps: float, yaw_rate_rps: float, rear_axle_x_m: float) -
 
 def drive_planar(xy: F64, yaw_rad: F64, elapsed_s: F64, drive: Drive, rear_axle_x_m: float) -> tuple[F64, F64]:
     """Places (M, 2) and yaws (M,) of car frames after `elapsed_s` (M,), seen from above on level ground."""
-    forward = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], axis=-1)
+    forward = np.stack([sm.cos(yaw_rad), sm.sin(yaw_rad)], axis=-1)
     turned = drive.yaw_rate_rps * elapsed_s
     chord = drive.speed_mps * elapsed_s * np.sinc(turned / (2.0 * np.pi))
     along = yaw_rad + 0.5 * turned
-    rear = xy + rear_axle_x_m * forward + chord[:, None] * np.stack([np.cos(along), np.sin(along)], axis=-1)
+    rear = xy + rear_axle_x_m * forward + chord[:, None] * np.stack([sm.cos(along), sm.sin(along)], axis=-1)
     yaw = yaw_rad + turned
-    return rear - rear_axle_x_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1), yaw
+    return rear - rear_axle_x_m * np.stack([sm.cos(yaw), sm.sin(yaw)], axis=-1), yaw
 
 
 def _draw_speed(must_move: bool, config: MotionConfig, rng: np.random.Generator) -> float:
