@@ -10,12 +10,13 @@ import json
 import os
 import re
 import tempfile
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from pydantic import ValidationError
 
 from augkitti.cad_formats import MODEL_SUFFIXES, inside, read_model
@@ -24,6 +25,7 @@ from augkitti.cad_surfaces import WHEEL_NAME
 from augkitti.cad_vehicle import ModelFacts, build_model, content_digest
 from augkitti.errors import InputError
 from augkitti.scan_pair import GLASS, CarModel
+from augkitti.yaml_text import read_yaml
 
 LOADER_VERSION = 2  # part of the cache key: raise it when a file would come out differently
 
@@ -88,8 +90,7 @@ def load_cad_folder(
         try:
             model, decisions = _load_cached(candidate, cache_dir)
         except InputError as err:
-            why = f"{err.problem}; {err.remedy}"
-            report.append(CadDecision(candidate.name, relative, "", None, 0, 0.0, (), " ".join(why.split())))
+            report.append(CadDecision(candidate.name, relative, "", None, 0, 0.0, (), err.reason))
             continue
         problem = None
         if categories is not None and model.category not in categories:
@@ -130,7 +131,7 @@ def _candidates(folder: Path) -> list["_Candidate | CadDecision"]:
             found.append(_from_manifest(root, name, facts))
             covered.update(_covered(root, found[-1]))
         except InputError as err:
-            found.append(CadDecision(name, facts.main_file or "", "", None, 0, 0.0, (), f"{err.problem}; {err.remedy}"))
+            found.append(CadDecision(name, facts.main_file or "", "", None, 0, 0.0, (), err.reason))
     names = {c.name for c in found}
     groups: dict[Path, list[Path]] = {}
     for path in sorted(root.rglob("*")):
@@ -174,15 +175,19 @@ def _read_manifest(path: Path) -> list[ModelFacts]:
         entries = document["models"]
         facts = [ModelFacts.model_validate(e) for e in entries]
     except ValidationError as err:
-        first = err.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(path, f"key `{key}`: {first['msg']}", remedy) from err
+        raise InputError(path, _first_problem(err), remedy) from err
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as err:
         raise InputError(path, f"not a manifest ({type(err).__name__}: {err})", remedy) from err
     for entry in facts:
         if not entry.name or not entry.main_file:
             raise InputError(path, "an entry without `name` or `main_file`", remedy)
     return facts
+
+
+def _first_problem(err: ValidationError) -> str:
+    first = err.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    return f"key `{key[:80]}`: {first['msg'][:200]}"
 
 
 def _from_manifest(root: Path, name: str, facts: ModelFacts) -> _Candidate:
@@ -206,7 +211,7 @@ def _from_file(
         facts, source = _read_sidecar(path)
         named = tuple(inside(path.parent, w, path) for w in facts.wheel_files)
     except InputError as err:
-        return CadDecision(name, relative, "", None, 0, 0.0, (), f"{err.where}: {err.problem}; {err.remedy}")
+        return CadDecision(name, relative, "", None, 0, 0.0, (), str(err))
     # with several bodies in one folder nothing tells whose the wheels are
     return _Candidate(
         facts.name or name, path.resolve(), group, facts, source, named or (wheels if bodies == 1 else ())
@@ -219,16 +224,11 @@ def _read_sidecar(model: Path) -> tuple[ModelFacts, str]:
         if not path.is_file():
             continue
         remedy = "give it the fields of one manifest entry"
+        content = read_yaml(path, remedy) or {}
         try:
-            return ModelFacts.model_validate(
-                yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-            ), f"sidecar {path.name}"
+            return ModelFacts.model_validate(content), f"sidecar {path.name}"
         except ValidationError as err:
-            first = err.errors()[0]
-            key = ".".join(str(part) for part in first["loc"])
-            raise InputError(path.name, f"key `{key}`: {first['msg']}", remedy) from err
-        except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as err:
-            raise InputError(path.name, f"not readable as YAML ({err})", remedy) from err
+            raise InputError(path.name, _first_problem(err), remedy) from err
     return ModelFacts.model_validate({}), ""
 
 
@@ -301,7 +301,9 @@ def _read_cache(path: Path) -> tuple[CarModel, tuple[str, ...]] | None:
             )
         decisions = tuple(str(d) for d in text["decisions"])
         return (model, decisions) if content_digest(model) == model.digest else None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, NotImplementedError, RuntimeError):
+        return None  # the reader of zip files raises the last two on damaged flags
+    except (zipfile.BadZipFile, zlib.error, MemoryError, tokenize.TokenError, SyntaxError):
         return None
 
 

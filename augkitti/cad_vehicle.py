@@ -4,7 +4,7 @@ import hashlib
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -46,6 +46,11 @@ CATEGORY_OF_CLASS = {
 }
 
 
+_Length = Annotated[float, Field(gt=0.0, lt=100.0)]
+_Component = Annotated[float, Field(gt=-1e3, lt=1e3)]
+_Axis = tuple[_Component, _Component, _Component]
+
+
 class _Glass(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
     material: str
@@ -60,17 +65,17 @@ class ModelFacts(BaseModel):
     main_file: str | None = None
     vehicle_class: str | None = Field(None, alias="class")
     body: str | None = None
-    length_m: float | None = Field(None, gt=0)
-    width_m: float | None = Field(None, gt=0)
-    height_m: float | None = Field(None, gt=0)
-    up_axis: Vector | None = None
-    forward_axis: Vector | None = None
-    unit_scale: float | None = Field(None, gt=0)
+    length_m: _Length | None = None
+    width_m: _Length | None = None
+    height_m: _Length | None = None
+    up_axis: _Axis | None = None
+    forward_axis: _Axis | None = None
+    unit_scale: float | None = Field(None, gt=1e-9, lt=1e9)
     glass: tuple[_Glass, ...] | None = None
     other_translucent: tuple[str, ...] = ()
     drop_materials: tuple[str, ...] = ()
     wheel_files: tuple[str, ...] = ()
-    wheel_centres_m: tuple[Vector, ...] = ()
+    wheel_centres_m: tuple[_Axis, ...] = ()
 
 
 def build_model(

@@ -9,10 +9,10 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from augkitti.errors import InputError
+from augkitti.yaml_text import read_yaml
 
 
 class _Section(BaseModel):
@@ -183,12 +183,7 @@ def load_config(path: Path | None, **changes: Any) -> Config:
     """
     values: dict[str, Any] = {}
     if path is not None:
-        try:
-            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as err:
-            raise InputError(
-                path, f"not readable as YAML ({err})", "see `augkitti config show` for a valid file"
-            ) from err
+        loaded = read_yaml(path, "see `augkitti config show` for a valid file")
         if loaded is not None and not isinstance(loaded, dict):
             raise InputError(path, "not a table of keys and values", "see `augkitti config show` for a valid file")
         values = loaded or {}
