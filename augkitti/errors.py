@@ -2,6 +2,8 @@
 
 from os import PathLike
 
+_LONGEST = 400  # characters of a problem that are shown; a damaged file may hold a number of thousands of digits
+
 
 class _Told(Exception):
     """An error with a place, a problem and a remedy; arguments go to `super()` unchanged, so that it pickles."""
@@ -12,8 +14,14 @@ class _Told(Exception):
         self.problem = problem
         self.remedy = remedy
 
+    @property
+    def reason(self) -> str:
+        """The problem and the remedy in one line, without the place."""
+        problem = self.problem if len(self.problem) <= _LONGEST else f"{self.problem[:_LONGEST]} ..."
+        return _one_line(f"{problem}; {self.remedy}")
+
     def __str__(self) -> str:
-        return " ".join(f"{self.where}: {self.problem}; {self.remedy}".split())
+        return f"{_one_line(self.where)}: {self.reason}"
 
 
 class InputError(_Told):
@@ -33,3 +41,8 @@ class MachineError(_Told):
 
     Never a reason to leave a pair out, so it is no `InputError`. Arguments as there.
     """
+
+
+def _one_line(text: str) -> str:
+    """Without breaks, and without what a terminal would act on: a damaged file's words stand in messages."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(text.split()))
