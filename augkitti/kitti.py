@@ -44,6 +44,7 @@ _LAST_POINTS = 200
 # and 61 of 64 were seen): beam 48 of 64 looks down by 17.1 degrees.
 _LAST_ELEVATION_RAD = math.radians(-17.0)
 _MIN_QUADRANT_SHARE = 0.002  # a whole revolution sees ground on every side; a camera-view crop does not
+_LARGEST = 1e9  # of numbers in calibration, poses, packets and times: 1e6 is met; far beyond, products overflow
 _FETCH = "fetch the file again"
 _TREE = (
     "expected ROOT/raw/2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data/0000000000.bin (raw drives), "
@@ -533,6 +534,8 @@ def _numbers(text: str, count: int, where: str) -> F64:
         raise InputError(where, "holds something that is no number", _FETCH) from err
     if len(numbers) != count or not np.isfinite(numbers).all():
         raise InputError(where, f"{count} finite numbers expected, {len(numbers)} found", _FETCH)
+    if np.abs(numbers).max() > _LARGEST:
+        raise InputError(where, f"holds {numbers[np.argmax(np.abs(numbers))]:g}, which no such file holds", _FETCH)
     return numbers
 
 
@@ -610,7 +613,7 @@ def _sidecar_of(path: Path, stat: tuple[int, int]) -> dict[str, Any]:
     remedy = 'see the format in the documentation, for example {"label_coverage": "full"}'
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as err:
+    except (OSError, ValueError, RecursionError) as err:
         raise InputError(path, f"not readable as JSON ({type(err).__name__})", remedy) from err
     if not isinstance(content, dict) or not set(content) <= {"label_coverage", "velo_poses"}:
         raise InputError(path, "holds keys other than `label_coverage` and `velo_poses`", remedy)

@@ -87,7 +87,7 @@ def load_profile(path: Path | None = None) -> ScannerProfile:
         return profile_from_content(json.loads(text), DEFAULT_PROFILE)
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as err:
+    except (OSError, ValueError, RecursionError) as err:
         raise InputError(path, f"not readable as a scanner profile ({err})", "give a profile JSON file") from err
     return profile_from_content(content, str(path))
 
@@ -100,12 +100,22 @@ def profile_from_content(content: Any, where: str) -> ScannerProfile:
         elevation = np.asarray(content["elevation_rad"], dtype=np.float64)
         beams, lattice = len(elevation), int(content["lattice_size"])
 
-        def column(key: str, scale: float = 1.0) -> F64:
-            values = np.asarray(content[key], dtype=np.float64) * scale
-            if values.shape != (beams,) or not np.isfinite(values).all():
-                raise ValueError(f"`{key}` needs {beams} finite numbers, one a beam")
-            return values
+        def column(key: str, largest: float, scale: float = 1.0) -> F64:
+            values = np.asarray(content[key], dtype=np.float64)
+            if values.shape != (beams,) or not (np.abs(values) <= largest).all():  # NaN is no number here
+                raise ValueError(f"`{key}` needs {beams} numbers from {-largest:g} to {largest:g}, one a beam")
+            return values * scale
 
+        def number(key: str, largest: float) -> float:
+            value = float(content[key])
+            if not 0.0 < value <= largest:
+                raise ValueError(f"`{key}` is not above 0 and up to {largest:g}")
+            return value
+
+        if not (1 <= beams <= 255 and beams < lattice < NO_TICK and (np.diff(elevation) < 0).all()):
+            raise ValueError("`elevation_rad` must fall from beam to beam, 1 to 255 beams, fewer than 65535 ticks")
+        if not 0 <= int(content["seam_tick"]) < lattice or not 0 <= int(content["shadow_first_ring"]) <= beams:
+            raise ValueError("`seam_tick` or `shadow_first_ring` is no tick or beam of it")
         shadow = content["never_returned_ticks"]
         if len(shadow) != beams:
             raise ValueError(f"`never_returned_ticks` needs {beams} lists, one a beam")
@@ -116,28 +126,26 @@ def profile_from_content(content: Any, where: str) -> ScannerProfile:
                     raise ValueError(f"`never_returned_ticks` of beam {ring} leaves 0 to {lattice - 1}")
                 blind[ring, first : last + 1] = True
         blind[: int(content["shadow_first_ring"])] = False
-        if not (1 <= beams <= 255 and beams < lattice < NO_TICK and (np.diff(elevation) < 0).all()):
-            raise ValueError("`elevation_rad` must fall from beam to beam, 1 to 255 beams, fewer than 65535 ticks")
         return ScannerProfile(
             name=str(content["name"]),
             version=int(content["version"]),
             source=str(content["source"]),
             lattice_size=lattice,
             seam_tick=int(content["seam_tick"]),
-            firing_period_s=float(content["firing_period_s"]),
-            range_quantum_m=float(content["range_quantum_m"]),
-            coordinate_quantum_m=float(content["coordinate_quantum_m"]),
-            reflectance_quantum=float(content["reflectance_quantum"]),
-            min_range_m=float(content["min_range_m"]),
-            max_range_m=float(content["max_range_m"]),
+            firing_period_s=number("firing_period_s", 1.0),
+            range_quantum_m=number("range_quantum_m", 1.0),
+            coordinate_quantum_m=number("coordinate_quantum_m", 1.0),
+            reflectance_quantum=number("reflectance_quantum", 1.0),
+            min_range_m=number("min_range_m", 1e4),
+            max_range_m=number("max_range_m", 1e4),
             shadow_first_ring=int(content["shadow_first_ring"]),
-            elevation_rad=column("elevation_rad"),
-            height_m=column("height_m"),
-            side_m=column("side_m"),
-            azimuth_rad=column("azimuth_rad"),
-            tick_offset=column("tick_offset").astype(np.int32),
-            range_phase_m=column("range_phase_mm", 1e-3),
-            range_bias_m=column("range_bias_mm", 1e-3),
+            elevation_rad=column("elevation_rad", np.pi / 2.0),
+            height_m=column("height_m", 100.0),
+            side_m=column("side_m", 100.0),
+            azimuth_rad=column("azimuth_rad", 2.0 * np.pi),
+            tick_offset=column("tick_offset", float(lattice)).astype(np.int32),
+            range_phase_m=column("range_phase_mm", 1e4, 1e-3),
+            range_bias_m=column("range_bias_mm", 1e4, 1e-3),
             blind=blind,
             content=content,
         )

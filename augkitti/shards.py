@@ -202,11 +202,7 @@ def to_table(pair: AugmentedPair, schema: pa.Schema = SCHEMA) -> pa.Table:
     for k, scan in enumerate((pair.scan0, pair.scan1)):
         for name in ("xyz", *_PER_POINT, "removed"):
             values[f"{name}{k}"] = getattr(scan, name)
-    for name, length in (
-        *((f"{name}{k}", n) for name in ("xyz", *_PER_POINT) for k, n in enumerate((n0, n1))),
-        ("flow0", n0),
-        ("flow_status0", n0),
-    ):
+    for name, length in _lengths(n0, n1):
         if len(values[name]) != length:
             raise ValueError(f"{pair.pair_id}: {name} has {len(values[name])} rows, the scan {length}")
     values["objects"] = [_object_row(item) for item in pair.objects]
@@ -214,6 +210,12 @@ def to_table(pair: AugmentedPair, schema: pa.Schema = SCHEMA) -> pa.Table:
 
 
 _PER_POINT = ("reflectance", "ring", "tick", "source", "instance", "surface")
+
+
+def _lengths(n0: int, n1: int) -> list[tuple[str, int]]:
+    """Columns that have a row a point, with how many."""
+    columns = [(f"{name}{k}", n) for name in _PER_POINT for k, n in enumerate((n0, n1))]
+    return [*columns, ("flow0", n0), ("flow_status0", n0)]
 
 
 def _array(value: Any, type_: pa.DataType) -> pa.Array:
@@ -306,7 +308,7 @@ def read_pair_ids(path: Path) -> list[str]:
     """The names of a shard's pairs in order; errors as `open_shard`."""
     file, _ = open_shard(path)
     with file:
-        names: list[str] = _read(path, lambda: file.read(columns=["pair_id"])).column("pair_id").to_pylist()
+        names: list[str] = _plain_columns(file, path, ["pair_id"])[0]
         return names
 
 
@@ -314,8 +316,15 @@ def read_frames(path: Path) -> list[tuple[int, int]]:
     """`frame0` and `frame1` of a shard's pairs in order; errors as `open_shard`."""
     file, _ = open_shard(path)
     with file:
-        table = _read(path, lambda: file.read(columns=["frame0", "frame1"]))
-    return list(zip(table.column("frame0").to_pylist(), table.column("frame1").to_pylist(), strict=True))
+        first, second = _plain_columns(file, path, ["frame0", "frame1"])
+    return list(zip(first, second, strict=True))
+
+
+def _plain_columns(file: pq.ParquetFile, path: Path, names: list[str]) -> list[list[Any]]:
+    table = _read(path, lambda: file.read(columns=names))
+    if any(table.column(name).null_count for name in names):
+        raise InputError(path, f"holds a row without {' or '.join(names)}", "generate it again, or copy it again")
+    return [table.column(name).to_pylist() for name in names]
 
 
 def _row_group(file: pq.ParquetFile, path: Path, row: int) -> AugmentedPair:
@@ -362,6 +371,11 @@ def from_table(table: pa.Table) -> AugmentedPair:
         )
         for k in (0, 1)
     ]
+    for name, length in _lengths(len(scans[0].xyz), len(scans[1].xyz)):
+        values = row[name]
+        found = len(values) // 3 if name == "flow0" else len(values)
+        if found != length:
+            raise ValueError(f"{name} has {found} rows, the scan {length}")
     azimuth = row["label_azimuth"]
     values = {name: row[name] for name in _FLAT}
     return AugmentedPair(
