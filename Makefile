@@ -8,7 +8,7 @@ CAD ?= ../shared/cad
 STREETS ?= build/streets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types bench clean
+.PHONY: help demo test fuzz check lint types bench clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -31,6 +31,9 @@ lint: $(STAMP)
 
 types: $(STAMP)
 	$(BIN)/mypy
+
+fuzz: $(STAMP) ## 2,000 damaged files of each format to every reader; prints the table of docs/reliability.md
+	$(BIN)/python tests/fuzz_readers.py
 
 check: lint types test ## what CI runs
 
