@@ -46,6 +46,7 @@ bench: $(STAMP) ## speed and accuracy figures of docs/figures.md, on KITTI=, CAD
 	$(BIN)/python benchmarks/movers.py --kitti $(KITTI)
 	$(BIN)/python benchmarks/cad_library.py $(CAD)
 	$(BIN)/python benchmarks/window_shares.py $(KITTI) $(CAD)
+	$(BIN)/python benchmarks/generate.py $(KITTI) $(CAD)
 	$(BIN)/python benchmarks/street_vs_real.py $(KITTI) $(STREETS)
 
 clean: ## remove the environment and caches
