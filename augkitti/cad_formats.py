@@ -24,6 +24,8 @@ MODEL_SUFFIXES = (".glb", ".gltf", ".obj", ".dae", ".ply", ".off")
 SOLID = 0.95  # an opacity from here on is solid: JPEG noise in opacity images stays above it
 _MAX_BYTES = 512 * 1024 * 1024
 _MAX_FACES = 5_000_000
+_MAX_PIXELS = 8192 * 8192
+_MAX_PLACES = 20_000  # nodes of a COLLADA scene, those that instances repeat counted each time
 _EDGE_PER_DIAGONAL = 1 / 130  # 4 cm of a car's 5.2 m
 _MAX_CUTS = 7
 
@@ -60,8 +62,14 @@ class _Part:
     material: Material
 
 
-def inside(folder: Path, relative: str, owner: Path) -> Path:
+def inside(folder: Path, relative: str, owner: Path, start: Path | None = None) -> Path:
     """The path of a file named by `owner`, which must lie in `folder` (links followed).
+
+    Args:
+        folder: that it may not leave.
+        relative: the name as it stands in the file, percent-encoded or not.
+        owner: the file, for errors.
+        start: where names begin, in `folder`; by default `folder`.
 
     Raises:
         InputError: absolute, a URL, or outside of the folder.
@@ -71,9 +79,10 @@ def inside(folder: Path, relative: str, owner: Path) -> Path:
     if "\0" in name or "://" in name or PurePosixPath(name).is_absolute() or (len(name) > 1 and name[1] == ":"):
         raise InputError(owner, f"points outside of its folder ({relative!r})", remedy)
     try:
-        path = (folder / name).resolve()
+        path = ((start or folder) / name).resolve()
         root = folder.resolve()
-    except (OSError, RuntimeError) as err:
+        path.exists()  # a name too long is told here
+    except (OSError, RuntimeError, ValueError) as err:
         raise InputError(owner, f"names a path that does not resolve ({relative!r})", remedy) from err
     if path != root and root not in path.parents:
         raise InputError(owner, f"points outside of its folder ({relative!r})", remedy)
@@ -88,13 +97,13 @@ class _FolderResolver:
 
     def get(self, name: str) -> bytes:
         # `..` inside the model's folder is fine (Gazebo's meshes/ beside materials/); outside of it is not
-        relative = str(self.path.parent.resolve().relative_to(self.root.resolve()) / unquote(name.strip()))
-        target = inside(self.root, relative, self.path)
+        target = inside(self.root, name.strip(), self.path, self.path.parent)
         if not target.is_file():
             raise FileNotFoundError(name)
         if target.stat().st_size > _MAX_BYTES:
             raise InputError(target, "larger than 512 MiB", "simplify the model")
-        return target.read_bytes()
+        content = target.read_bytes()
+        return _as_utf8(content) if target.suffix.lower() == ".mtl" else content
 
     def __getitem__(self, name: str) -> bytes:
         return self.get(name)
@@ -166,6 +175,9 @@ def _join(
     faces = np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=False)]).astype(np.int32)
     material = np.concatenate([np.full(len(p.faces), i, np.int32) for i, p in enumerate(parts)])
     opacity = np.concatenate([p.opacity for p in parts]).astype(np.float32)
+    if not np.isfinite(opacity).all():
+        notes = [*notes, "an opacity that is no number is taken as solid"]
+    opacity = np.clip(np.where(np.isfinite(opacity), opacity, np.float32(1.0)), np.float32(0.0), np.float32(1.0))
     finite = np.isfinite(vertices).all(axis=1)[faces].all(axis=1)
     if not finite.all():
         notes = [*notes, f"{int((~finite).sum())} faces with NaN left out"]
@@ -198,11 +210,15 @@ def _scene_meshes(scene: Any) -> list[tuple[str, Any, F64]]:
     """(node name, mesh, vertices with the node transforms applied) of a trimesh scene, in file order."""
     from trimesh import Trimesh
 
-    found = []
+    found: list[tuple[str, Any, F64]] = []
+    total = 0
     for node in scene.graph.nodes_geometry:
         T, name = scene.graph[node]
         mesh = scene.geometry[name]
         if isinstance(mesh, Trimesh) and len(mesh.faces):
+            total += len(mesh.faces)
+            if total > _MAX_FACES:  # one mesh placed ten thousand times: told before it is copied
+                raise ValueError(f"holds more than {_MAX_FACES} triangles")
             T = np.asarray(T, dtype=np.float64)
             v = np.asarray(mesh.vertices, dtype=np.float64)
             placed = np.stack(
@@ -235,12 +251,22 @@ def _gltf_document(data: bytes) -> dict[str, Any]:
     return document
 
 
+def _check_tree(nodes: list[dict[str, Any]]) -> None:
+    """Refuse nodes with two parents: glTF forbids it, and a chain of them is a scene that doubles at each step."""
+    children = [child for node in nodes for child in node.get("children", [])]
+    if len(set(children)) < len(children):
+        raise ValueError("a node has two parents")
+
+
 def _read_gltf(path: Path, data: bytes, resolver: _FolderResolver) -> tuple[list[_Part], list[str]]:
     document = _gltf_document(data)
+    _check_tree(document.get("nodes", []))
+    if any(a.get("count", 0) > 3 * _MAX_FACES for a in document.get("accessors", [])):
+        raise ValueError("an accessor counts more than any vehicle has")
     for thing in [*document.get("buffers", []), *document.get("images", [])]:
         uri = thing.get("uri", "")
         if uri and not uri.startswith("data:"):
-            inside(resolver.root, str(path.parent.resolve().relative_to(resolver.root.resolve()) / unquote(uri)), path)
+            inside(resolver.root, uri, path, path.parent)
     transmission = {
         m.get("name"): float(
             m.get("extensions", {}).get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0)
@@ -290,11 +316,12 @@ def _alpha_image(texture: Any) -> F32 | None:
     """The alpha channel (H, W) of a PIL image, 0 to 1; None where it has none."""
     if texture is None:
         return None
+    _check_pixels(texture)
     if texture.mode == "P" and "transparency" in texture.info:
         texture = texture.convert("RGBA")
     if "A" not in texture.getbands():
         return None
-    return np.asarray(texture.getchannel("A"), dtype=np.float32) / np.float32(255.0)
+    return _as_shares(texture.getchannel("A"))
 
 
 def _diagonal(scene: Any) -> float:
@@ -305,11 +332,21 @@ def _diagonal(scene: Any) -> float:
 # --- OBJ ---
 
 
+def _as_utf8(data: bytes) -> bytes:
+    """Text of any encoding as UTF-8: names of materials are often Latin-1, and all else is ASCII."""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1").encode("utf-8")
+    return data
+
+
 def _read_obj(path: Path, data: bytes, resolver: _FolderResolver) -> tuple[list[_Part], list[str]]:
+    data = _as_utf8(data)
     for line in data.splitlines():
         if line.startswith(b"mtllib"):
             name = line.split(None, 1)[1].decode("utf-8", "replace").strip()
-            inside(resolver.root, str(path.parent.resolve().relative_to(resolver.root.resolve()) / name), path)
+            inside(resolver.root, name, path, path.parent)
     scene = _load_scene(path, data, resolver)
     diagonal = _diagonal(scene)
     parts: list[_Part] = []
@@ -368,9 +405,22 @@ def _opacity_image(value: Any, resolver: _FolderResolver) -> tuple[F32 | None, s
         image: Image.Image = Image.open(io.BytesIO(resolver.get(name)))
     except FileNotFoundError:
         return None, f"opacity image {name} is missing: taken as solid"
+    _check_pixels(image)
     if "A" in image.getbands():
         image = image.getchannel("A")
-    return np.asarray(image.convert("L"), dtype=np.float32) / np.float32(255.0), ""
+    return _as_shares(image), ""
+
+
+def _check_pixels(image: Any) -> None:
+    if image.width * image.height > _MAX_PIXELS:  # a file of some kilobytes can hold a gigabyte of one colour
+        raise ValueError(f"an image has {image.width} x {image.height} pixels, more than 8192 x 8192")
+
+
+def _as_shares(image: Any) -> F32:
+    """A PIL image's grey values (H, W), 0 to 1."""
+    shares = np.array(image.convert("L"), dtype=np.float32)
+    shares /= np.float32(255.0)
+    return shares
 
 
 # --- textured opacity ---
@@ -431,16 +481,21 @@ def _read_dae(
     import collada
     import defusedxml.ElementTree as ElementTree
 
-    ElementTree.fromstring(data, forbid_dtd=True)  # no document types, no entities; pycollada reads what is left
+    root = ElementTree.fromstring(data, forbid_dtd=True)  # no document types, no entities; pycollada reads the rest
+    _check_places(root)
     document = collada.Collada(io.BytesIO(data), ignore=[collada.common.DaeError])
     up = {"X_UP": (1.0, 0.0, 0.0), "Z_UP": (0.0, 0.0, 1.0)}.get(str(document.assetInfo.upaxis), (0.0, 1.0, 0.0))
     unit = document.assetInfo.unitmeter
     notes = []
     for image in document.images:
-        relative = str(path.parent.resolve().relative_to(resolver.root.resolve()) / str(image.path))
-        if not inside(resolver.root, relative, path).is_file():
+        try:  # images of a COLLADA file are never opened; where the artist's disk is named, the car is still good
+            found = inside(resolver.root, str(image.path), path, path.parent).is_file()
+        except InputError:
+            found = False
+        if not found:
             notes.append(f"image {image.path} is missing")
     parts: list[_Part] = []
+    total = 0
     if document.scene is None:
         return parts, up, unit, notes
     for geometry in document.scene.objects("geometry"):
@@ -451,6 +506,9 @@ def _read_dae(
             index = getattr(primitive, "vertex_index", None)
             if index is None or np.asarray(index).ndim != 2 or np.asarray(index).shape[1] != 3 or not len(index):
                 continue  # lines and points
+            total += len(index)
+            if total > _MAX_FACES:
+                raise ValueError(f"holds more than {_MAX_FACES} triangles")
             effect = getattr(primitive.material, "effect", None)
             name = str(getattr(primitive.material, "name", None) or getattr(primitive.material, "id", None) or "")
             opacity, source = (1.0, "") if effect is None else dae_opacity(effect)
@@ -461,6 +519,37 @@ def _read_dae(
             vertices = np.asarray(primitive.vertex, dtype=np.float64)
             parts.append(_part(vertices, index, opacity, Material(name, node, colour, source)))
     return parts, up, None if unit is None else float(unit), notes
+
+
+def _check_places(root: Any) -> None:
+    """Refuse scenes that instances of instances blow up, or that hold themselves."""
+    named = {node.get("id"): node for node in root.iter() if _local(node) == "node" and node.get("id")}
+    known: dict[str, int] = {}
+
+    def places(node: Any, above: tuple[str, ...]) -> int:
+        count = 1
+        for child in node:
+            if _local(child) == "node":
+                count += places(child, above)
+            elif _local(child) == "instance_node":
+                name = str(child.get("url", "")).lstrip("#")
+                if name in above:
+                    raise ValueError("a node holds itself")
+                if name in named and name not in known:
+                    known[name] = places(named[name], (*above, name))
+                count += known.get(name, 0)
+        if count > _MAX_PLACES:
+            raise ValueError(f"its scene has more than {_MAX_PLACES} nodes")
+        return count
+
+    for scene in root.iter():
+        if _local(scene) == "visual_scene":
+            places(scene, ())
+
+
+def _local(element: Any) -> str:
+    """An element's name without its namespace."""
+    return str(element.tag).rpartition("}")[2]
 
 
 def dae_opacity(effect: Any) -> tuple[float, str]:

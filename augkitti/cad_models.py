@@ -27,7 +27,7 @@ from augkitti.errors import InputError
 from augkitti.scan_pair import GLASS, CarModel
 from augkitti.yaml_text import read_yaml
 
-LOADER_VERSION = 2  # part of the cache key: raise it when a file would come out differently
+LOADER_VERSION = 3  # part of the cache key: raise it when a file would come out differently
 
 
 @dataclass(frozen=True)

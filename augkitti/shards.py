@@ -324,7 +324,10 @@ def _plain_columns(file: pq.ParquetFile, path: Path, names: list[str]) -> list[l
     table = _read(path, lambda: file.read(columns=names))
     if any(table.column(name).null_count for name in names):
         raise InputError(path, f"holds a row without {' or '.join(names)}", "generate it again, or copy it again")
-    return [table.column(name).to_pylist() for name in names]
+    try:
+        return [table.column(name).to_pylist() for name in names]
+    except UnicodeDecodeError as err:
+        raise InputError(path, f"damaged ({_line(err)})", "generate it again, or copy it again") from err
 
 
 def _row_group(file: pq.ParquetFile, path: Path, row: int) -> AugmentedPair:

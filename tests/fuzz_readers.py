@@ -759,6 +759,18 @@ def _yaml_bomb(content: bytes, rng: random.Random) -> bytes:
     return b"\n".join([*lines[:at], chosen, *lines[at:]])
 
 
+def _loader():
+    import yaml
+
+    return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def _dumper():
+    import yaml
+
+    return getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
 def _yaml_value(content: bytes, rng: random.Random) -> bytes:
     """As `_json_value`, in YAML."""
     import yaml
@@ -766,8 +778,9 @@ def _yaml_value(content: bytes, rng: random.Random) -> bytes:
     if b"&" in content:  # a bomb is in it already
         return _lines(content, rng)
     with contextlib.suppress(yaml.YAMLError, ValueError, RecursionError):
-        harmed = _json_value(json.dumps(yaml.safe_load(content)).encode(), rng)
-        return yaml.safe_dump(json.loads(harmed), sort_keys=False, allow_unicode=True).encode("utf-8", "surrogatepass")
+        harmed = _json_value(json.dumps(yaml.load(content, Loader=_loader())).encode(), rng)
+        text = yaml.dump(json.loads(harmed), Dumper=_dumper(), sort_keys=False, allow_unicode=True)
+        return text.encode("utf-8", "surrogatepass")
     return _any_token(content, rng)
 
 

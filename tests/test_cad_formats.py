@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from augkitti.cad_formats import dae_opacity, inside, read_model, sample_image
+from augkitti.cad_models import load_cad_folder
 from augkitti.errors import InputError
 
 SQUARE = (
@@ -210,3 +211,74 @@ def test_faces_with_nan_are_left_out_and_said(tmp_path):
     raw = read_model(tmp_path / "car.off")
     assert len(raw.faces) == 1
     assert "NaN" in raw.warnings[0]
+
+
+def test_names_in_latin_1_are_read(tmp_path):
+    (tmp_path / "car.obj").write_bytes(("mtllib car.mtl\n" + SQUARE.replace("pane", "tür")).encode("latin-1"))
+    (tmp_path / "car.mtl").write_bytes("newmtl tür\nd 0.25\n".encode("latin-1"))
+    raw = read_model(tmp_path / "car.obj")
+    assert raw.materials[0].name == "tür"
+    np.testing.assert_allclose(raw.opacity, 0.25)
+
+
+def test_an_opacity_that_is_no_number_is_solid_and_said(tmp_path):
+    raw = obj(tmp_path, "d nan\n")
+    assert (raw.opacity == 1).all()
+    assert "no number" in raw.warnings[0]
+
+
+def test_a_chain_of_nodes_that_doubles_at_each_step_is_refused(tmp_path):
+    nodes = [{"children": [k + 1, k + 1]} for k in range(40)] + [{"mesh": 0}]
+    with pytest.raises(InputError, match="two parents"):
+        read_model(gltf(tmp_path, {}, nodes=nodes))
+
+
+def test_a_mesh_placed_a_million_times_is_refused(tmp_path):
+    path = tmp_path / "car.dae"
+    nodes = "".join(f'<node id="n{k}">{f"""<instance_node url="#n{k + 1}"/>""" * 10}</node>' for k in range(12))
+    for first, problem in (("n0", "more than"), ("self", "holds itself")):
+        path.write_text(
+            '<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><library_nodes>'
+            f'{nodes}<node id="self"><instance_node url="#self"/></node></library_nodes><library_visual_scenes>'
+            f'<visual_scene id="s"><node><instance_node url="#{first}"/></node></visual_scene>'
+            '</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>'
+        )
+        with pytest.raises(InputError, match=problem):
+            read_model(path)
+
+
+def test_an_image_of_more_pixels_than_memory_is_refused(tmp_path):
+    Image.new("1", (9000, 9000)).save(tmp_path / "huge.png")
+    with pytest.raises(InputError, match="pixels"):
+        obj(tmp_path, "map_d huge.png\n")
+
+
+OUTSIDE = ("../secret", "/etc/hostname", "file:///etc/hostname", "http://localhost/x", "%2e%2e/secret", "%252e%252e/x")
+
+
+@pytest.mark.parametrize("name", [*OUTSIDE, "link", "..%5csecret", "A" * 5000, "\ud800"])
+@pytest.mark.parametrize("how", ["buffer", "image", "mtllib", "map_d", "sidecar", "manifest"])
+def test_no_file_leads_out_of_its_folder(tmp_path, how, name):
+    home = tmp_path / "home"
+    home.mkdir()
+    (tmp_path / "secret").write_bytes(b"secret" * 100)
+    (home / "link").symlink_to(tmp_path / "secret")
+    where, words = json.dumps(name), name.encode("utf-8", "surrogatepass")
+    if how == "buffer":
+        gltf(home, {}, buffers=[{"byteLength": 42, "uri": name}])
+    elif how == "image":
+        gltf(home, {}, images=[{"uri": name}])
+    else:
+        (home / "car.obj").write_bytes(
+            b"mtllib " + (words if how == "mtllib" else b"car.mtl") + b"\n" + SQUARE.encode()
+        )
+        (home / "car.mtl").write_bytes(b"newmtl pane\nmap_d " + (words if how == "map_d" else b"gone.png") + b"\n")
+    if how == "sidecar":
+        (home / "car.yaml").write_text(f"wheel_files: [{where}]\n")
+    elif how == "manifest":
+        (home / "manifest.json").write_text(f'{{"models": [{{"name": "x", "main_file": {where}}}]}}')
+    with pytest.raises(InputError) as caught:
+        load_cad_folder(home)
+    assert "secretsecret" not in str(caught.value)
+    if name in (*OUTSIDE[:4], "link"):
+        assert "outside of its folder" in str(caught.value)

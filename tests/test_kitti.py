@@ -228,6 +228,9 @@ def test_an_unreadable_scan_is_one_line_with_file_problem_and_remedy(copy, spoil
         ("augkitti_source.json", '{"label_coverage": "everything"}'),
         ("augkitti_source.json", '{"velo_poses": "../poses.txt"}'),
         ("augkitti_source.json", '{"velo_poses": "gone.txt"}'),
+        ("augkitti_source.json", "[" * 100_000),
+        ("oxts/data/0000000040.txt", "1e300 " * 30),
+        ("../calib_imu_to_velo.txt", "R: 1e300 0 0 0 1 0 0 0 1\nT: 0 0 0\n"),
     ],
 )
 def test_a_malformed_file_beside_the_scans_is_one_line(copy, file: str, content: str | bytes) -> None:

@@ -126,3 +126,23 @@ def test_profile_that_is_no_json_names_the_file(tmp_path: Path) -> None:
     path.write_text("{")
     with pytest.raises(InputError, match=r"mine\.json"):
         scanner.load_profile(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("tick_offset", [1e300] * 64),
+        ("height_m", [float("nan")] * 64),
+        ("azimuth_rad", [1e6] * 64),
+        ("range_quantum_m", 0.0),
+        ("max_range_m", float("inf")),
+        ("lattice_size", 10**9),
+        ("seam_tick", -1),
+        ("shadow_first_ring", 65),
+        ("version", "A" * 5000),
+    ],
+)
+def test_a_profile_out_of_range_is_refused_in_one_short_line(key, value):
+    with pytest.raises(InputError) as caught:
+        scanner.profile_from_content({**PROFILE.content, key: value}, "profile.json")
+    assert len(str(caught.value)) < 600

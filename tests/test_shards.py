@@ -298,3 +298,21 @@ def test_importing_the_package_loads_nothing_heavy():
 def test_public_names_are_there():
     assert all(hasattr(augkitti, name) for name in augkitti.__all__)
     assert callable(augkitti.augment_pair)
+
+
+@pytest.mark.parametrize("name", ["reflectance0", "ring1", "source0", "surface1", "flow0", "flow_status0"])
+def test_columns_of_unequal_length_are_refused(shard, tmp_path, name):
+    table = pq.read_table(shard).slice(0, 1)
+    at = table.column_names.index(name)
+    values = table.column(at)[0].as_py()[:-3]
+    path = tmp_path / "cut.parquet"
+    pq.write_table(table.set_column(at, table.schema.field(at), pa.array([values], table.schema.field(at).type)), path)
+    with pytest.raises(InputError, match=f"{name} has .* rows, the scan"):
+        read_pair(path, 0)
+
+
+def test_a_message_is_one_short_line_that_no_terminal_acts_on():
+    message = str(InputError("a\nb.txt", "holds `\x1b[31m\u202e" + "9" * 5000 + "`\n", "fetch it again"))
+    assert message.isprintable()
+    assert len(message) < 600
+    assert message.startswith("a b.txt: holds `\\x1b[31m\\u202e999")
