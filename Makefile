@@ -8,7 +8,7 @@ CAD ?= ../shared/cad
 STREETS ?= build/streets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test fuzz check lint types bench clean
+.PHONY: help demo test fuzz trust check lint types bench clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -34,6 +34,9 @@ types: $(STAMP)
 
 fuzz: $(STAMP) ## 2,000 damaged files of each format to every reader; prints the table of docs/reliability.md
 	$(BIN)/python tests/fuzz_readers.py
+
+trust: $(STAMP) ## the same bytes from killed runs, one and two processes, other processors; prints the digests
+	$(BIN)/python benchmarks/trust.py $(KITTI) $(CAD)
 
 check: lint types test ## what CI runs
 

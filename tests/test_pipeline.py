@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import shutil
 from dataclasses import fields, replace
 from pathlib import Path
@@ -128,6 +129,36 @@ def test_resuming_with_other_settings_is_refused_and_named(drives, cache, tmp_pa
         prepare_stage(options_of(drives, tmp_path / "aug", cache, n=2), jobs=1, resume=True)
     with pytest.raises(InputError, match="another seed"):
         prepare_stage(options_of(drives, tmp_path / "aug", cache, n=2, seed=1, min_points=30), jobs=1, resume=True)
+
+
+@pytest.mark.parametrize("key", ["program version", "pairs (--n)", "scanner profile", "car models", "source"])
+def test_a_run_begun_with_another_program_car_or_source_is_not_resumed(drives, cache, tmp_path, key):
+    options = options_of(drives, tmp_path / "aug", cache, n=2)
+    prepare_stage(options, jobs=1, resume=False)
+    state = tmp_path / "aug" / WORK / "run.json"
+    content = json.loads(state.read_text())
+    assert set(content["identity"]) == {
+        *("program version", "pairs (--n)", "seed", "configuration", "scanner profile", "car models", "source")
+    }
+    content["identity"][key] = "another"
+    state.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=f"was begun with another {re.escape(key)};"):
+        generate(options, jobs=1, resume=True, dry_run=False)
+
+
+def test_a_scan_that_turns_unreadable_under_a_run_stops_it_and_mended_it_goes_on(made, drives, cache, tmp_path):
+    root, out = tmp_path / "kitti", tmp_path / "aug"
+    shutil.copytree(drives, root)
+    prepare_stage(options_of(root, out, cache, n=5, stop_on_error=True), jobs=1, resume=False)
+    scan = root / "raw/2011_09_26/2011_09_26_drive_0005_sync/velodyne_points/data/0000000041.bin"
+    content = scan.read_bytes()
+    scan.write_bytes(content[:-5])
+    with pytest.raises(InputError, match="cut short"):
+        augment_stage(out, jobs=1)
+    scan.write_bytes(content)
+    augment_stage(out, jobs=1)
+    assert finish_stage(out) == 0
+    assert digests(out) == digests(made)
 
 
 def test_a_larger_set_holds_the_pairs_of_a_smaller_one_unchanged(made, drives, cache, tmp_path):
