@@ -9,6 +9,7 @@ from typing import Literal
 
 from augkitti import kitti, manifest
 from augkitti.errors import InputError
+from augkitti.remote import as_source
 
 State = Literal["complete", "part", "damaged", "missing", "other"]
 
@@ -37,7 +38,7 @@ def data_status(root: Path | str) -> tuple[DriveStatus, ...]:
     Raises:
         InputError: the root is no folder.
     """
-    path = Path(root)
+    path = as_source(root)
     if not path.is_dir():
         raise InputError(path, "is not a folder", "give the folder that KITTI is in or is to be downloaded to")
     found = {sequence.name: sequence for sequence in kitti.find_sequences(path)}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from augkitti.dataset_index import SPLITS_NAME, DatasetIndex, ShardEntry, read_index
 from augkitti.errors import InputError
+from augkitti.remote import as_path
 from augkitti.scan_pair import AugmentedPair
 from augkitti.shards import read_pair, read_pair_ids, read_pairs
 from augkitti.splits import read_splits
@@ -27,7 +28,7 @@ class Dataset:
     """
 
     def __init__(self, folder: Path | str, split: str | None = None) -> None:
-        self.folder = Path(folder)
+        self.folder = as_path(folder)
         self.index = read_index(self.folder)
         self.shards = self.index.shards if split is None else _shards_of(self.folder, self.index, split)
         self._ends = tuple(accumulate(shard.rows for shard in self.shards))

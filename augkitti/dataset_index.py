@@ -15,6 +15,7 @@ import yaml
 from augkitti import __version__
 from augkitti.config import Config
 from augkitti.errors import InputError
+from augkitti.remote import as_path
 from augkitti.shards import CONTRACT_VERSION
 from augkitti.shards import replace_whole as replace_whole
 
@@ -132,7 +133,7 @@ def read_index(folder: Path | str) -> DatasetIndex:
     Raises:
         InputError: the folder is missing or unfinished, or its index is malformed or of an unknown contract version.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     path = folder / INDEX_NAME
     if not folder.is_dir():
         problem = "is not a folder" if folder.exists() else "does not exist"

@@ -32,6 +32,7 @@ from augkitti.ego_motion import METHOD, EgoMotion, find_ego_motion, odometry_mot
 from augkitti.errors import InputError
 from augkitti.frames import F64, Array, compose, invert, is_rigid, orthonormal, rigid, rotate_vectors
 from augkitti.kitti_labels import BoxesByFrame, read_object_labels, read_tracking_labels, read_tracklets
+from augkitti.remote import as_source
 from augkitti.scan_pair import Bool, LabelledBox, Scan, ScanKind, ScanPair
 
 SIDECAR = "augkitti_source.json"
@@ -117,7 +118,7 @@ def open_root(root: Path | str) -> KittiRoot:
     Raises:
         InputError: the root is missing, no folder, or holds no scan in a known layout; names the tree expected.
     """
-    path = Path(root)
+    path = as_source(root)
     if not path.is_dir():
         problem = "is not a folder" if path.exists() else "does not exist"
         raise InputError(path, problem, _TREE)

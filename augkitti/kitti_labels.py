@@ -5,6 +5,7 @@ rectified camera frame (y down) with `rotation_y`; they need `T_velo_cam`. All b
 """
 
 import math
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def read_tracklets(path: Path) -> BoxesByFrame:
         InputError: not readable, not XML, entities declared in it, or not the tracklet format.
     """
     try:
-        root = ElementTree.parse(path, forbid_dtd=False).getroot()
+        root = ElementTree.parse(BytesIO(path.read_bytes()), forbid_dtd=False).getroot()
     except (DefusedXmlException, ElementTree.ParseError, OSError, ValueError, LookupError) as err:
         raise InputError(path, f"not readable as tracklets ({_one_line(err)})", _FETCH) from err
     boxes: dict[int, list[LabelledBox]] = {}

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from augkitti import __version__
 from augkitti.config import Config
 from augkitti.errors import InputError
+from augkitti.remote import as_path, is_remote, open_anywhere, put_whole
 from augkitti.scan_pair import AugmentedPair, AugmentedScan, CarModel, ObjectRecord
 from augkitti.scanner import ScannerProfile
 
@@ -167,7 +168,13 @@ def write_shard(path: Path, pairs: Iterable[AugmentedPair], metadata: Mapping[st
 
 
 def replace_whole(path: Path, write: Callable[[BinaryIO], Any]) -> None:
-    """Let `write` fill a temporary file beside `path`, then rename it: the file is there whole or not at all."""
+    """Let `write` fill a temporary file beside `path`, then rename it: the file is there whole or not at all.
+
+    On an object store a local file is handed over when it is whole.
+    """
+    if is_remote(path):
+        put_whole(path, write)
+        return
     temporary = path.parent / f".{path.name}.{os.getpid()}.{uuid4().hex[:8]}.tmp"
     try:
         with temporary.open("xb") as file:
@@ -244,9 +251,9 @@ def open_shard(path: Path) -> tuple[pq.ParquetFile, dict[str, Any]]:
         InputError: missing, no Parquet file, no shard, of an unknown contract version, or of other columns.
     """
     try:
-        file = pq.ParquetFile(path)
+        file = pq.ParquetFile(open_anywhere(path), pre_buffer=is_remote(path))
     except (OSError, pa.ArrowException) as err:
-        problem = "does not exist" if not Path(path).exists() else f"not readable as Parquet ({_line(err)})"
+        problem = "does not exist" if not as_path(path).exists() else f"not readable as Parquet ({_line(err)})"
         raise InputError(path, problem, "generate the data set again, or copy it again") from err
     try:
         metadata = json.loads((file.schema_arrow.metadata or {})[METADATA_KEY])

@@ -26,6 +26,7 @@ from augkitti.dataset_index import (
     write_text,
 )
 from augkitti.errors import InputError
+from augkitti.remote import as_path
 from augkitti.seeds import generator
 from augkitti.shards import CONTRACT_VERSION, read_frames
 
@@ -66,10 +67,10 @@ def split_dataset(
     Raises:
         InputError: the folder is unfinished; ratios that are none; too few recordings; recordings that `like` lacks.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     index = read_index(folder)
     if like is not None:
-        splits = split_like(index.shards, Path(like))
+        splits = split_like(index.shards, as_path(like))
     else:
         wanted = check_ratios(ratios)
         recordings = {shard.recording for shard in index.shards if shard.rows}

@@ -28,6 +28,7 @@ from augkitti.dataset_index import (
 from augkitti.errors import InputError
 from augkitti.ground import fit_ground
 from augkitti.kitti import KittiRoot, open_root, read_scan_rows
+from augkitti.remote import as_path
 from augkitti.scan_pair import AugmentedPair
 from augkitti.shards import open_shard, read_pairs
 from augkitti.splits import check_splits, read_splits
@@ -97,9 +98,9 @@ def validate_folder(folder: Path | str, kitti_root: Path | str | None = None, jo
     """
     from joblib import Parallel, delayed
 
-    folder = Path(folder)
+    folder = as_path(folder)
     index = read_index(folder)
-    root = None if kitti_root is None else Path(kitti_root)
+    root = None if kitti_root is None else as_path(kitti_root)
     if root is not None:
         open_root(root)  # a wrong root is answered before any work
     run = Parallel(n_jobs=max(1, min(jobs, len(index.shards))), batch_size=1)

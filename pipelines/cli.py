@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from augkitti.errors import InputError, MachineError
+from augkitti.remote import as_path
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 config_app = typer.Typer(no_args_is_help=True, help="Every setting of generation.")
@@ -29,20 +30,38 @@ app.add_typer(cad_app, name="cad")
 app.add_typer(data_app, name="data")
 app.add_typer(cache_app, name="cache")
 
+
+def _place(text: str) -> Path:
+    """A local folder, or an address such as `s3://bucket/folder`."""
+    try:
+        return as_path(str(text))
+    except InputError as err:
+        raise typer.BadParameter(str(err)) from None
+
+
 DEFAULT_OUT = Path("augkitti-data")
 
 Kitti = Annotated[
     Path | None,
-    typer.Option(envvar="AUGKITTI_KITTI", help="Folder with KITTI in it. Without: embedded streets."),
+    typer.Option(
+        parser=_place,
+        metavar="PATH",
+        envvar="AUGKITTI_KITTI",
+        help="Folder with KITTI in it, or an address: s3://bucket/kitti. Without: embedded streets.",
+    ),
 ]
-Out = Annotated[Path, typer.Option(help="Folder of the data set.")]
-Folder = Annotated[Path, typer.Argument(metavar="[DATASET]", help="Folder of the data set.", show_default=True)]
+Out = Annotated[Path, typer.Option(parser=_place, metavar="PATH", help="Folder of the data set.")]
+Folder = Annotated[
+    Path, typer.Argument(parser=_place, metavar="[DATASET]", help="Folder of the data set.", show_default=True)
+]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes.")]
 Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers make the shards: tcp://host:8786.")
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")]
-Cad = Annotated[Path | None, typer.Option(help="Folder of car models. Without: cars made in code.")]
+Cad = Annotated[
+    Path | None, typer.Option(parser=_place, metavar="PATH", help="Folder of car models. Without: cars made in code.")
+]
 Pairs = Annotated[int, typer.Option("--n", min=1, help="Pairs to make.")]
 Cars = Annotated[str | None, typer.Option(metavar="1-3", help="Virtual cars a pair; 0: plain pairs, labels only.")]
 Categories = Annotated[

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from augkitti.errors import InputError, MachineError
+from augkitti.remote import is_remote, put_whole
 
 NAME = "lock"
 _WITHOUT_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
@@ -31,6 +32,13 @@ def hold(work: Path) -> Iterator[None]:
         MachineError: the folder cannot be written.
     """
     path = work / NAME
+    if is_remote(work):
+        _take(path)
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
+        return
     try:
         work.mkdir(parents=True, exist_ok=True)
         file = _locked(path)
@@ -50,6 +58,9 @@ def check_free(work: Path) -> None:
     Raises:
         InputError: as said.
     """
+    if is_remote(work):
+        _check_object(work / NAME)
+        return
     with suppress(OSError):  # no lock file, or none that can be opened: `hold` tells
         os.close(_locked(work / NAME, create=False))
 
@@ -85,9 +96,37 @@ def _locked(path: Path, create: bool = True) -> int:
         os.close(file)  # the run that held it ended just now and took the file away
 
 
-def _held(path: Path, content: dict[str, Any]) -> InputError:
+def _take(path: Path) -> None:
+    """Put a lock on a store that has none; of two runs that try at once, a store that can tell lets one.
+
+    Raises:
+        InputError: another run holds it.
+    """
+    _check_object(path)
+    path.unlink(missing_ok=True)
+    try:
+        put_whole(path, lambda file: file.write(json.dumps(_own()).encode()), new=True)
+    except FileExistsError:
+        _check_object(path)
+
+
+def _check_object(path: Path) -> None:
+    """Refuse a lock on a store whose run lives, or may live on another host.
+
+    Raises:
+        InputError: as said.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except (FileNotFoundError, ValueError):
+        return
+    if isinstance(content, dict) and _lives(content):
+        raise _held(path, content, f"; if it is dead, remove {path}")
+
+
+def _held(path: Path, content: dict[str, Any], more: str = "") -> InputError:
     who = f"process {content.get('process', '?')} on {content.get('host', '?')}"
-    return InputError(path.parent.parent, f"is held by another run ({who})", "wait for it, or end it first")
+    return InputError(path.parent.parent, f"is held by another run ({who})", f"wait for it, or end it first{more}")
 
 
 def _own() -> dict[str, Any]:

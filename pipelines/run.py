@@ -29,6 +29,7 @@ from augkitti.dataset_index import (
 )
 from augkitti.errors import InputError, MachineError
 from augkitti.kitti import KittiRoot, Sequence, known_ego_motion, label_reach, open_root, read_labels
+from augkitti.remote import as_path, copy_here, is_remote, remove_all
 from augkitti.scan_pair import CarModel
 from augkitti.scanner import ScannerProfile, load_profile
 from augkitti.shards import read_metadata, shard_metadata
@@ -150,7 +151,7 @@ def load_library(cad: Path, categories: tuple[str, ...], cache: Path) -> "CadLib
     """The models of a folder, read once a process."""
     from augkitti.cad_models import load_cad_folder
 
-    return load_cad_folder(cad, categories, cache / "cad")
+    return load_cad_folder(copy_here(cad, cache / "cad-copies"), categories, cache / "cad")
 
 
 def load_models(cad: Path | None, config: Config, cache: Path) -> tuple[CarModel, ...]:
@@ -245,6 +246,8 @@ def check_output(out: Path, resume: bool) -> None:
                 raise InputError(out / (foreign or held)[0], "is no part of a run", "take another --out")
         elif out.exists():
             raise InputError(out, "is not a folder", "take another --out")
+        if is_remote(out):
+            return  # told by the lock, the first thing that is written
         nearest = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
         with tempfile.TemporaryFile(dir=nearest):
             pass
@@ -338,8 +341,8 @@ def reopen_run(out: Path) -> Run:
     settings = content["options"]
     try:
         options = Options(
-            kitti=None if settings["kitti"] is None else Path(settings["kitti"]),
-            cad=None if settings["cad"] is None else Path(settings["cad"]),
+            kitti=None if settings["kitti"] is None else as_path(settings["kitti"]),
+            cad=None if settings["cad"] is None else as_path(settings["cad"]),
             out=out,
             n=int(settings["n"]),
             seed=int(settings["seed"]),
@@ -382,6 +385,10 @@ def end_work(out: Path) -> None:
     """Take the work folder away: the data set is finished."""
     work = out / WORK
     if not work.is_dir():
+        return
+    if is_remote(work):
+        (work / _STATE).unlink(missing_ok=True)
+        remove_all(work)
         return
     with suppress(OSError):
         (work / _STATE).unlink(missing_ok=True)  # first: without it the run is no longer unfinished
