@@ -5,6 +5,7 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -36,6 +37,7 @@ GAP_FRAMES = 10  # frames left out where a recording is divided: a second of dri
 _EXACT_RECORDINGS = 9  # up to here every assignment is tried: 3^9 = 19 683
 _CUTS = 40  # places tried where a recording of a toy set is divided
 _STARTS = 12  # of the search beyond
+_SWAPS = 400  # recordings from which on swaps are not tried: moves alone come as near as one small recording
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,10 @@ def split_recordings(
     """
     wanted = check_ratios(ratios)
     names = sorted({shard.recording for shard in shards})
-    pairs = np.array([sum(s.rows for s in shards if s.recording == name) for name in names], dtype=np.int64)
+    rows: Counter[str] = Counter()
+    for shard in shards:
+        rows[shard.recording] += shard.rows
+    pairs = np.array([rows[name] for name in names], dtype=np.int64)
     usable = [i for i in range(len(names)) if pairs[i] > 0]
     used = [k for k, ratio in enumerate(wanted) if ratio > 0]
     if len(usable) < len(used):
@@ -286,6 +291,8 @@ def _search(
         chosen[i] = empty[0] if must else int(np.argmax(lacks / target))
         lacks[chosen[i]] -= pairs[i]
     cost = float(np.abs(lacks).sum())
+    if len(pairs) > _SWAPS:
+        return _moves(pairs, chosen, lacks)
     while True:
         best = (cost - 1e-9, -1, -1, -1)
         counts = np.bincount(chosen, minlength=splits)
@@ -307,6 +314,26 @@ def _search(
             chosen[j] = chosen[i]
         chosen[i] = k
         cost = float(np.abs(lacks).sum())
+
+
+def _moves(
+    pairs: npt.NDArray[np.int64], chosen: npt.NDArray[np.int64], lacks: npt.NDArray[np.float64]
+) -> tuple[float, npt.NDArray[np.int64]]:
+    """The best move of one recording to another split, again and again while one helps."""
+    splits = len(lacks)
+    while True:
+        cost = float(np.abs(lacks).sum())
+        rest = cost - np.abs(lacks)[:, None] - np.abs(lacks)[None, :]
+        size = pairs[:, None].astype(np.float64)
+        after = rest[chosen] + np.abs(lacks[chosen][:, None] + size) + np.abs(lacks[None, :] - size)
+        after[np.arange(len(pairs)), chosen] = np.inf
+        after[np.bincount(chosen, minlength=splits)[chosen] <= 1] = np.inf
+        i, k = divmod(int(np.argmin(after)), splits)
+        if not after[i, k] < cost - 1e-9:
+            return cost, chosen
+        lacks[chosen[i]] += pairs[i]
+        lacks[k] -= pairs[i]
+        chosen[i] = k
 
 
 def _after(lacks: npt.NDArray[np.float64], a: int, b: int, moved: int) -> float:
@@ -359,7 +386,8 @@ def check_splits(index: DatasetIndex, splits: Splits) -> list[str]:
         f"split `{name}` is none of {', '.join(SPLIT_NAMES)}" for name in splits.splits if name not in SPLIT_NAMES
     ]
     if not splits.divides_recordings:
-        problems += [f"{path} is in no split" for path in by_path if path not in set(listed)]
+        somewhere = set(listed)
+        problems += [f"{path} is in no split" for path in by_path if path not in somewhere]
         problems += _divided(by_path, splits.splits)
     return problems
 

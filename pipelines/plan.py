@@ -25,6 +25,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from augkitti.errors import InputError
 from augkitti.seeds import generator, pair_seed
@@ -112,8 +113,7 @@ def stream(shard: ShardPlan, frames: Sequence[int], seed: int) -> Iterator[Candi
     pool = list(frames[low:high])
     for again in range(SPARE_PASSES + 1):
         variant = shard.round if again == 0 else SPARE_VARIANT + shard.round * SPARE_PASSES + again - 1
-        order = generator(seed, "order", shard.sequence, shard.pool, variant).permutation(len(pool))
-        for index in order:
+        for index in _order(shard, variant, len(pool), seed):
             frame0 = pool[int(index)]
             pair_id = f"{shard.sequence}/{frame0}/{variant}"
             yield Candidate(pair_id, frame0, variant, pair_seed(seed, shard.sequence, frame0, variant))
@@ -121,8 +121,16 @@ def stream(shard: ShardPlan, frames: Sequence[int], seed: int) -> Iterator[Candi
 
 def first_choice(shard: ShardPlan, frames: Sequence[int], seed: int) -> tuple[int, ...]:
     """First frames of the pairs that the shard makes if none is skipped, ascending: what to prepare."""
-    candidates = stream(shard, frames, seed)
-    return tuple(sorted({next(candidates).frame0 for _ in range(shard.quota)}))
+    low, high = _bounds(len(frames), shard.pool, shard.pools)
+    if shard.quota >= high - low:  # the whole pool, in whatever order
+        return tuple(frames[low:high])
+    order = _order(shard, shard.round, high - low, seed)
+    return tuple(sorted(frames[low + int(index)] for index in order[: shard.quota]))
+
+
+def _order(shard: ShardPlan, variant: int, count: int, seed: int) -> npt.NDArray[np.int64]:
+    """The drawn order of a pool of `count` pairs at a variant."""
+    return generator(seed, "order", shard.sequence, shard.pool, variant).permutation(count)
 
 
 def _slots(sequences: Sequence[tuple[str, int]], taken: int, seed: int, round_: int, in_turn: bool) -> list[int]:

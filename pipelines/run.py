@@ -110,8 +110,9 @@ class Run:
     def planned_frames(self) -> dict[str, tuple[int, ...]]:
         """First frames of the pairs that are made if none is skipped, by sequence name."""
         frames: dict[str, set[int]] = {}
+        there = {name: self.frames0(name) for name in {shard.sequence for shard in self.shards}}
         for shard in self.shards:
-            chosen = first_choice(shard, self.frames0(shard.sequence), self.options.seed)
+            chosen = first_choice(shard, there[shard.sequence], self.options.seed)
             frames.setdefault(shard.sequence, set()).update(chosen)
         return {name: tuple(sorted(frames[name])) for name in sorted(frames)}
 

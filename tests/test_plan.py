@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augkitti.errors import InputError
-from pipelines.plan import POOL_PAIRS, SPARE_VARIANT, ShardPlan, plan_shards, stream
+from pipelines.plan import POOL_PAIRS, SPARE_VARIANT, ShardPlan, first_choice, plan_shards, stream
 
 DRIVES = (("a", 8), ("b", 70), ("c", 1), ("d", 33))
 ROUND = sum(count for _, count in DRIVES)
@@ -92,3 +92,12 @@ def test_another_seed_gives_other_pairs():
 def test_a_source_without_pairs_is_refused():
     with pytest.raises(InputError, match="no two neighbouring scans"):
         plan_shards((("single", 0),), 5, 0)
+
+
+def test_what_is_prepared_is_what_the_stream_gives_first():
+    frames = tuple(range(5, 78))
+    for quota in (1, 7, 24, 25):
+        for pool in (0, 2):
+            shard = ShardPlan("drive", pool, 3, 4, min(quota, 24))
+            first = {next_.frame0 for next_, _ in zip(stream(shard, frames, 9), range(shard.quota), strict=False)}
+            assert first_choice(shard, frames, 9) == tuple(sorted(first))

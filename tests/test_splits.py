@@ -102,6 +102,12 @@ def test_many_recordings_come_within_a_pair_of_the_ratios(seed):
     assert off(shards, split_recordings(shards, RATIOS, seed)) < 4.0
 
 
+def test_thousands_of_recordings_are_split_to_the_ratios():
+    sizes = [1 + (7 * k) % 40 for k in range(3_000)]
+    shards = shards_of(sizes)
+    assert off(shards, split_recordings(shards)) < 3.0
+
+
 def test_many_recordings_of_one_huge_and_some_tiny_leave_no_split_empty():
     shards = shards_of([5000, *[1] * 11])
     assert (held(shards, split_recordings(shards)) > 0).all()
