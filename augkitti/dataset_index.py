@@ -167,7 +167,7 @@ def read_index(folder: Path | str) -> DatasetIndex:
             source=dict(content["source"]),
             program_version=str(content["program_version"]),
         )
-    except (KeyError, TypeError, ValueError) as err:
+    except (KeyError, TypeError, ValueError, OverflowError) as err:
         raise InputError(path, f"is no index of a data set ({type(err).__name__}: {err})", "generate it again") from err
 
 
@@ -300,12 +300,12 @@ def write_text(path: Path, text: str) -> None:
 
 def _inside(path: str) -> str:
     parts = PurePosixPath(path).parts
-    if not parts or PurePosixPath(path).is_absolute() or ".." in parts or "\\" in path:
+    if not parts or PurePosixPath(path).is_absolute() or ".." in parts or "\\" in path or not path.isprintable():
         raise ValueError(f"shard path {path!r} leads out of the folder")
     return path
 
 
 def _count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**53:
         raise ValueError(f"{value!r} is no count")
     return value

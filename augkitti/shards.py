@@ -252,7 +252,7 @@ def open_shard(path: Path) -> tuple[pq.ParquetFile, dict[str, Any]]:
     """
     try:
         file = pq.ParquetFile(open_anywhere(path), pre_buffer=is_remote(path))
-    except (OSError, pa.ArrowException) as err:
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as err:
         problem = "does not exist" if not as_path(path).exists() else f"not readable as Parquet ({_line(err)})"
         raise InputError(path, problem, "generate the data set again, or copy it again") from err
     try:
@@ -350,7 +350,7 @@ def _row_group(file: pq.ParquetFile, path: Path, row: int) -> AugmentedPair:
 def _read(path: Path, read: Any) -> pa.Table:
     try:
         return read()
-    except (OSError, pa.ArrowException) as err:
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as err:
         raise InputError(path, f"damaged ({_line(err)})", "generate it again, or copy it again") from err
 
 

@@ -204,6 +204,7 @@ def read_splits(path: Path) -> Splits:
     try:
         splits = {str(name): tuple(_strings(paths)) for name, paths in content["splits"].items()}
         ratios = tuple(float(ratio) for ratio in content["ratios"])
+        _strings(list(splits))
         if not isinstance(content["divides_recordings"], bool):
             raise ValueError("`divides_recordings` is true or false")
         return Splits(splits, ratios, int(content["seed"]), content["divides_recordings"])
@@ -214,7 +215,7 @@ def read_splits(path: Path) -> Splits:
 
 
 def _strings(values: Any) -> list[str]:
-    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+    if not isinstance(values, list) or not all(isinstance(value, str) and value.isprintable() for value in values):
         raise ValueError("a split is a list of shard paths")
     return values
 

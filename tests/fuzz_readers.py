@@ -552,7 +552,9 @@ def mutated(content: bytes, rng: random.Random, kind: str) -> bytes:
     of_kind = rng.random() < 0.67
     for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4))):
         harms = HARMS[kind] if of_kind else BYTE_HARMS
-        content = rng.choice(harms)(content, rng) if content else content
+        if not content or len(content) > 1 << 20:  # lines a thousand times over: enough
+            break
+        content = rng.choice(harms)(content, rng)
     return content
 
 
@@ -700,7 +702,7 @@ def _json_value(content: bytes, rng: random.Random) -> bytes:
         node[key] = "@@" if deep else rng.choice((*odd, *more, node[key], [node[key]], rng.choice(places)[0]))
     try:
         text = json.dumps(document, indent=rng.choice((None, 1)))
-    except ValueError:  # the document in itself
+    except (ValueError, RecursionError):  # the document in itself
         return _any_token(content, rng)
     return _encoded(text.replace('"@@"', deep) if deep else text)
 
