@@ -1,7 +1,7 @@
 """The cache on disk: names and arrays in, the same arrays out as long as they are there; bounded, oldest use out first.
 
 `CACHE/prepared/<2 digits>/<digest>.npz` is what `prepare` finds in scans and pairs, `CACHE/cad/car-<digest>.npz` are
-finished car models, `CACHE/streets/<digest>/` are embedded streets. A name is the digest of all that the content
+finished car models, `CACHE/cad-copies/<digest>/` models from a store, `CACHE/streets/<digest>/` embedded streets. A name is the digest of all that the content
 depends on, the program's own source among it: what is found is never stale. Nothing is lost but time with any of it.
 """
 
@@ -28,8 +28,18 @@ from augkitti.errors import InputError, MachineError
 
 BOUND_GB = 32.0  # all of KITTI raw prepared is about 25 GB
 _FORMAT = "prepared 1"
-_PATTERNS = {"prepared": "[0-9a-f][0-9a-f]/*.npz", "cad": "car-*.npz", "streets": "[0-9a-f]*"}
-_LEFT_OVER = ("prepared/[0-9a-f][0-9a-f]/.*.tmp", "cad/*.part", "streets/.*.part-*")  # of runs that died
+_PATTERNS = {
+    "prepared": "[0-9a-f][0-9a-f]/*.npz",
+    "cad": "car-*.npz",
+    "cad-copies": "[0-9a-f]*",
+    "streets": "[0-9a-f]*",
+}
+_LEFT_OVER = (
+    "prepared/[0-9a-f][0-9a-f]/.*.tmp",
+    "cad/*.part",
+    "cad-copies/.part-*",
+    "streets/.*.part-*",
+)  # of runs that died
 _STREETS_STAY_S = _LEFT_OVER_STAYS_S = 86_400.0  # streets are a run's source: not taken from under one
 
 
@@ -152,7 +162,7 @@ def trim(folder: Path, bound: float | None = None) -> int:
     for entry in there:
         if total <= limit:
             break
-        if entry.kind == "streets" and now - entry.used_s < _STREETS_STAY_S:
+        if entry.kind in ("streets", "cad-copies") and now - entry.used_s < _STREETS_STAY_S:
             continue
         _remove(entry.path)
         total, dropped = total - entry.bytes, dropped + 1
