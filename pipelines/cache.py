@@ -1,8 +1,9 @@
 """The cache on disk: names and arrays in, the same arrays out as long as they are there; bounded, oldest use out first.
 
 `CACHE/prepared/<2 digits>/<digest>.npz` is what `prepare` finds in scans and pairs, `CACHE/cad/car-<digest>.npz` are
-finished car models, `CACHE/cad-copies/<digest>/` models from a store, `CACHE/streets/<digest>/` embedded streets. A name is the digest of all that the content
-depends on, the program's own source among it: what is found is never stale. Nothing is lost but time with any of it.
+finished car models, `CACHE/cad-copies/<digest>/` models from a store, `CACHE/streets/<digest>/` embedded streets. A
+name is the digest of all that the content depends on, the program's own source among it: what is found is never stale.
+Nothing is lost but time with any of it.
 """
 
 import hashlib
