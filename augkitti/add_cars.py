@@ -6,12 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from augkitti.config import Config
-from augkitti.frames import F32, F64, compose, invert, points_in_box, rotate_vectors, transform_points
+from augkitti.frames import (
+    F64,
+    Array,
+    compose,
+    invert,
+    points_in_box,
+    pose_from_xyz_yaw,
+    rotate_vectors,
+    transform_points,
+)
 from augkitti.labelled_objects import LabelledObjects, pair_interval
 from augkitti.occlusion import Occluded, keep_nearest, measured_range
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
 from augkitti.placement import car_box
-from augkitti.raycast import CarHits, cast_car, cross_box, rays_near
+from augkitti.raycast import CarHits, bearings_of, box_corners, cast_car, cross_box, rays_near
 from augkitti.scan_pair import (
     I16,
     MEASURED,
@@ -24,7 +33,7 @@ from augkitti.scan_pair import (
     ScanPair,
     VirtualCar,
 )
-from augkitti.scanner import ScannerProfile, ray_lines
+from augkitti.scanner import ScannerProfile, lines_of_rays
 from augkitti.scene_flow import scene_flow
 from augkitti.sensor_noise import CarLook, CarReturns, simulate_returns
 
@@ -54,41 +63,49 @@ def cast_and_measure(
     """Cast a car into both scans, each ray at its own firing time, and send the pulses."""
     opaque = config.glass == "opaque"
     look = CarLook(paint=car.paint, tint=float(rng.random()))
-    twist = ego_twist(pair.ego_motion, pair_interval(pair))
     hits, returns = [], []
-    for prepared, pose, moment, start in (
-        (scan0, car.pose0, car.moment0_s, 0.0),
-        (scan1, car.pose1, car.moment1_s, pair_interval(pair)),
-    ):
-        rays = prepared.rays
-        rolling = prepared.scan.kind == "raw" and config.shutter == "rolling"
-        near = rays_near(
-            rays, pose, car.model.size_m, _NEAR_M + (_sweep_drift(car, twist, prepared) if rolling else 0.0)
-        )
-        times = rays.ray_time_s[near] if rolling else np.full(len(near), moment)
-        moments, which = np.unique(times, return_inverse=True)
-        T_car_scanner = compose(invert(T_world_car(car, start + moments)), T_world_scanner(twist, start + moments))
-        its_hits = cast_car(car.model, T_car_scanner[which], rays, near, profile, opaque)
+    for k, prepared in enumerate((scan0, scan1)):
+        its_hits = cast_into_scan(car, k, pair, prepared, profile, config)
         hits.append(its_hits)
-        returns.append(simulate_returns(its_hits, look, rays, profile, opaque, rng))
+        returns.append(simulate_returns(its_hits, look, prepared.rays, profile, opaque, rng))
     return Cast((hits[0], hits[1]), (returns[0], returns[1]))
 
 
-def _sweep_drift(car: VirtualCar, twist: F64, prepared: PreparedScan) -> float:
-    """How far the car and the scanner move against each other while the sweep passes the car, at most (metres)."""
+def cast_into_scan(
+    car: VirtualCar, k: int, pair: ScanPair, prepared: PreparedScan, profile: ScannerProfile, config: Config
+) -> CarHits:
+    """What the rays of scan k meet on a car, each at its own firing time."""
+    rays, start = prepared.rays, k * pair_interval(pair)
+    pose, moment = (car.pose1, car.moment1_s) if k else (car.pose0, car.moment0_s)
+    twist = ego_twist(pair.ego_motion, pair_interval(pair))
+    rolling = prepared.scan.kind == "raw" and config.shutter == "rolling"
+    drift = _sweep_drift(car, pose, twist, prepared) if rolling else 0.0
+    near = rays_near(rays, pose, car.model.size_m, _NEAR_M + drift)
+    times = rays.ray_time_s[near] if rolling else np.full(len(near), moment)
+    moments, which = np.unique(times, return_inverse=True)
+    T_car_scanner = compose(invert(T_world_car(car, start + moments)), T_world_scanner(twist, start + moments))
+    return cast_car(car.model, T_car_scanner[which], rays, near, profile, config.glass == "opaque")
+
+
+def _sweep_drift(car: VirtualCar, pose: F64, twist: F64, prepared: PreparedScan) -> float:
+    """How far the car and the scanner move against each other between its moment and its rays, at most (metres)."""
     speed = abs(car.speed_mps) + float(np.sqrt((twist[:3] ** 2).sum()))
-    return speed * prepared.scan.period_s / 4.0
+    first, last = bearings_of(transform_points(pose, box_corners(car.model.size_m + 2.0 * _NEAR_M)))
+    share = min(0.25, (last - first) / (2.0 * np.pi))  # twice the half of the window: the drift widens it
+    return speed * prepared.scan.period_s * share
 
 
-def seen_well_enough(
-    casts: Sequence[Cast], scan0: PreparedScan, scan1: PreparedScan, profile: ScannerProfile, min_points: int
-) -> bool:
+def occlude_both(
+    casts: Sequence[Cast], scan0: PreparedScan, scan1: PreparedScan, profile: ScannerProfile
+) -> tuple[Occluded, Occluded]:
+    """Both scans with all cars in them."""
+    return occlude(casts, 0, scan0, profile), occlude(casts, 1, scan1, profile)
+
+
+def seen_well_enough(occluded: tuple[Occluded, Occluded], cars: int, min_points: int) -> bool:
     """Whether every car keeps at least `min_points` returns in both scans once all hide each other."""
-    for k, prepared in enumerate((scan0, scan1)):
-        simulated = occlude(casts, k, prepared, profile).simulated
-        if (np.bincount(simulated.car, minlength=len(casts)) < min_points).any():
-            return False
-    return True
+    counts = [np.bincount(scan.simulated.car, minlength=cars) for scan in occluded]
+    return all(int(count.min(initial=min_points)) >= min_points for count in counts)
 
 
 def keeps_its_shape(
@@ -102,9 +119,7 @@ def keeps_its_shape(
         (scan0, scan1), (car.pose0, car.pose1), cast.hits, cast.returns, strict=True
     ):
         ray, rays = hits.ray[returns.returned], prepared.rays
-        origin, direction = ray_lines(
-            profile, rays.ray_ring[ray], rays.ray_azimuth_rad[ray], rays.ray_elevation_rad[ray]
-        )
+        origin, direction = lines_of_rays(profile, rays, ray)
         points = origin + returns.range_m[returns.returned, None] * direction
         if not points_in_box(points, pose, car.model.size_m, _SHEAR_M).all():
             return False
@@ -119,21 +134,18 @@ def hides_what_is_behind(
     A model with open wheel arches or no floor lets pulses through from some sides; the car is then put elsewhere.
     """
     share, low, high = _BODY_MIDDLE
-    size = car.model.size_m
-    lower = np.array([-share * size[0] / 2, -share * size[1] / 2, (low - 0.5) * size[2]])
-    upper = np.array([share * size[0] / 2, share * size[1] / 2, (high - 0.5) * size[2]])
+    size = car.model.size_m * (share, share, high - low)
+    T_car_middle = pose_from_xyz_yaw(0.0, 0.0, (0.5 * (low + high) - 0.5) * float(car.model.size_m[2]), 0.0)
     for prepared, pose, hits, returns in zip(
         (scan0, scan1), (car.pose0, car.pose1), cast.hits, cast.returns, strict=True
     ):
         rays = prepared.rays
-        near = rays_near(rays, pose, size, 0.0)
-        origin, direction = ray_lines(
-            profile, rays.ray_ring[near], rays.ray_azimuth_rad[near], rays.ray_elevation_rad[near]
-        )
-        T_car_velo = invert(pose)
-        enter, leave = cross_box(
-            transform_points(T_car_velo, origin), rotate_vectors(T_car_velo, direction), lower, upper
-        )
+        T_velo_middle = compose(pose, T_car_middle)
+        near = rays_near(rays, T_velo_middle, size, 0.0)
+        origin, direction = lines_of_rays(profile, rays, near)
+        T_middle_velo = invert(T_velo_middle)
+        origin, direction = transform_points(T_middle_velo, origin), rotate_vectors(T_middle_velo, direction)
+        enter, leave = cross_box(origin, direction, -0.5 * size, 0.5 * size)
         through = (enter < leave) & (enter > 0.0)
         stopped = np.isin(near, hits.ray[np.isfinite(returns.stop_m)])
         measured = measured_range(prepared, near, profile)
@@ -154,13 +166,13 @@ def finish_pair(
     labelled: LabelledObjects,
     cars: Sequence[VirtualCar],
     casts: Sequence[Cast],
-    profile: ScannerProfile,
+    occluded: tuple[Occluded, Occluded],
     seed: int,
     pair_id: str,
 ) -> AugmentedPair:
     """Hide what the cars hide, label every point, and fill the contract's columns."""
     scan0, scan1 = prepared.scan0, prepared.scan1
-    occluded0, occluded1 = occlude(casts, 0, scan0, profile), occlude(casts, 1, scan1, profile)
+    occluded0, occluded1 = occluded
     first_car = len(labelled.objects)
     columns0 = _columns(scan0, occluded0, labelled.instance0, first_car)
     columns1 = _columns(scan1, occluded1, labelled.instance1, first_car)
@@ -202,19 +214,23 @@ def _columns(prepared: PreparedScan, occluded: Occluded, instance: I16, first_ca
     scan, rays, new = prepared.scan, prepared.rays, occluded.simulated
     kept = np.flatnonzero(occluded.kept)
     return AugmentedScan(
-        xyz=_joined(scan.xyz.take(kept, axis=0), new.xyz),
-        reflectance=np.concatenate([scan.reflectance[kept], new.reflectance]),
-        ring=np.concatenate([rays.ring[kept], new.ring]),
-        tick=np.concatenate([rays.tick[kept], new.tick]),
-        source=np.concatenate([scan.row[kept], np.full(len(new.xyz), -1, dtype=np.int32)]),
-        instance=np.concatenate([instance[kept], (new.car + first_car).astype(np.int16)]),
+        xyz=_joined(scan.xyz, kept, new.xyz),
+        reflectance=_joined(scan.reflectance, kept, new.reflectance),
+        ring=_joined(rays.ring, kept, new.ring),
+        tick=_joined(rays.tick, kept, new.tick),
+        source=_joined(scan.row, kept, np.full(len(new.xyz), -1, dtype=np.int32)),
+        instance=_joined(instance, kept, (new.car + first_car).astype(np.int16)),
         surface=np.concatenate([np.full(len(kept), MEASURED, dtype=np.uint8), new.surface]),
         removed=scan.row[~occluded.kept],
     )
 
 
-def _joined(measured: F32, simulated: F32) -> F32:
-    return np.ascontiguousarray(np.concatenate([measured, simulated]), dtype=np.float32)
+def _joined(measured: Array, kept: Array, simulated: Array) -> Array:
+    """The kept rows of a measured column, then the simulated ones."""
+    out = np.empty((len(kept) + len(simulated), *measured.shape[1:]), dtype=measured.dtype)
+    measured.take(kept, axis=0, out=out[: len(kept)], mode="clip")  # no buffer; all indices are in range
+    out[len(kept) :] = simulated
+    return out
 
 
 def _virtual_object(index: int, car: VirtualCar, cast: Cast, scan0: PreparedScan, scan1: PreparedScan) -> ObjectRecord:

@@ -11,11 +11,12 @@ from augkitti.add_cars import (
     finish_pair,
     hides_what_is_behind,
     keeps_its_shape,
+    occlude_both,
     seen_well_enough,
 )
 from augkitti.config import Config
 from augkitti.drivable import find_drivable_region
-from augkitti.ground import fit_ground
+from augkitti.ground import fit_ground, standing_points
 from augkitti.labelled_objects import label_points
 from augkitti.movers import unlabelled_movers
 from augkitti.placement import make_scene, propose_car
@@ -29,7 +30,7 @@ def prepare_scan(scan: Scan, profile: ScannerProfile, config: Config) -> Prepare
     rays = assign_rays(scan, profile)
     ground = fit_ground(scan.xyz, config.ground)
     region = find_drivable_region(scan, rays, ground, config.drivable)
-    return PreparedScan(scan, rays, ground, region)
+    return PreparedScan(scan, rays, ground, region, standing_points(scan.xyz, ground))
 
 
 def prepare_pair(pair: ScanPair, scan0: PreparedScan, scan1: PreparedScan, config: Config) -> PreparedPair:
@@ -69,6 +70,7 @@ def augment_pair(
 
     cars: list[VirtualCar] = []
     casts: list[Cast] = []
+    occluded = occlude_both(casts, scan0, scan1, profile)
     for attempt in range(config.placement.attempts):
         if len(cars) == wanted:
             break
@@ -76,13 +78,15 @@ def augment_pair(
         if car is None:
             continue
         cast = cast_and_measure(car, pair, scan0, scan1, profile, config, generator(seed, "look", attempt))
-        if (
-            keeps_its_shape(car, cast, scan0, scan1, profile)
-            and hides_what_is_behind(car, cast, scan0, scan1, profile)
-            and seen_well_enough([*casts, cast], scan0, scan1, profile, config.min_points)
-        ):
+        if not keeps_its_shape(car, cast, scan0, scan1, profile):
+            continue
+        if not hides_what_is_behind(car, cast, scan0, scan1, profile):
+            continue
+        together = occlude_both([*casts, cast], scan0, scan1, profile)
+        if seen_well_enough(together, len(casts) + 1, config.min_points):
             cars.append(car)
             casts.append(cast)
+            occluded = together
     if len(cars) < fewest:
         return None
-    return finish_pair(pair, prepared, labelled, cars, casts, profile, seed, pair_id)
+    return finish_pair(pair, prepared, labelled, cars, casts, occluded, seed, pair_id)

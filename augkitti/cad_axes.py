@@ -94,7 +94,7 @@ def _base(up: F64) -> F64:
 
 def _about_z(yaw: float) -> F64:
     """Rotation (3, 3) into axes turned by yaw."""
-    c, s = math.cos(yaw), math.sin(yaw)
+    s, c = sm.sincos(float(yaw))
     if abs(c) < 1e-12 or abs(s) < 1e-12:
         c, s = float(round(c)), float(round(s))
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -57,13 +57,34 @@ class Dataset:
 
     def _place(self, pair_id: str) -> tuple[Path, int]:
         sequence = pair_id.split("/")[0]
-        for shard in self.shards:
-            if shard.sequence == sequence:
-                path = self.folder / shard.path
-                names = read_pair_ids(path)
-                if pair_id in names:
-                    return path, names.index(pair_id)
+        paths = [shard.path for shard in self.shards if shard.sequence == sequence]
+        low, high = 0, len(paths)
+        while low < high:  # a sequence's shards are in the order of rounds and frames
+            middle = (low + high) // 2
+            names = read_pair_ids(self.folder / paths[middle])
+            if pair_id in names:
+                return self.folder / paths[middle], names.index(pair_id)
+            if _order(pair_id) < min(map(_order, names), default=(0, 0)):
+                high = middle
+            else:
+                low = middle + 1
+        for path in paths:  # unless another program wrote them
+            names = read_pair_ids(self.folder / path)
+            if pair_id in names:
+                return self.folder / path, names.index(pair_id)
         raise InputError(self.folder, f"holds no pair `{pair_id}`", "names are `<sequence>/<frame0>/<variant>`")
+
+
+_SPARE_VARIANT, _SPARE_PASSES = 1_000_000, 4  # as `pipelines.plan` numbers spares
+
+
+def _order(pair_id: str) -> tuple[int, int]:
+    """Round and first frame of a pair, by which a sequence's shards are in order; of an odd name anything."""
+    try:
+        frame0, variant = (int(part) for part in pair_id.split("/")[1:])
+    except ValueError:
+        return 0, 0
+    return variant if variant < _SPARE_VARIANT else (variant - _SPARE_VARIANT) // _SPARE_PASSES, frame0
 
 
 def open_dataset(folder: Path | str, split: str | None = None) -> Dataset:

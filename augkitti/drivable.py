@@ -14,7 +14,7 @@ from scipy import ndimage
 from augkitti import same_math as sm
 from augkitti._bev_grid import I64, cell_centres, cell_of, interpolate
 from augkitti.config import DrivableConfig
-from augkitti.frames import F64, Array
+from augkitti.frames import F64, Array, wrap_angle
 from augkitti.ground import height_at
 from augkitti.scan_pair import Bool, DrivableRegion, GroundMap, Scan, ScanRays
 
@@ -27,6 +27,11 @@ _LATERAL_BIN_M = 0.2
 _STRAY_LIMIT_M = 0.02  # a single kerb or rail must not make its whole surroundings rough
 _NEAR_RINGS_M = 20.0  # farther off, neighbouring rings lie more than a metre apart on the ground
 _RELIEF_M = 4.0  # slopes wider than this are no kerbs
+LARGEST_BEND_RAD = 0.7  # beyond it is a side street, if the region is long there
+_ROAD_WINDOW_M = 7.0  # half of the window in which the region's long axis is the road
+_ROAD_CELL_M = 0.8  # coarse is fine enough for an axis
+_EGO_ROAD_WEIGHT = 0.15  # of the ego road's axis, against 1 for a line and 0 for a square
+_LEAST_LONG = 0.3
 _TURN = 10.0  # more than 2 pi: keeps rings apart in one sorted list of azimuths
 
 
@@ -55,7 +60,40 @@ def find_drivable_region(scan: Scan, rays: ScanRays, ground: GroundMap, config: 
     free = _seen_or_passed_over(low, edge, ground, grid, config)
     blocked = _standing(p, above, grid, config) | _edge_lines(low, grid, config) | _kerbs(low, grid, config)
     region = _connected(free & ~blocked, grid, config)
-    return DrivableRegion(grid.origin_m, grid.cell_m, region, _road_heading(blocked, grid))
+    return with_headings(grid.origin_m, grid.cell_m, region, _road_heading(blocked, grid))
+
+
+def with_headings(
+    origin_m: tuple[float, float], cell_m: float, drivable: Bool, road_heading_rad: float
+) -> DrivableRegion:
+    """A region with the road's heading everywhere, within a right angle of the ego road's: its long axis round there.
+
+    Second moments of the region in a window; an axis and its opposite are one, hence doubled angles. Where the window
+    has no long axis (squares, junctions) the ego road's own heading stands.
+    """
+    step = max(1, round(_ROAD_CELL_M / cell_m))
+    window = 2 * int(_ROAD_WINDOW_M / (step * cell_m)) + 1
+    whole = -(-np.array(drivable.shape) // step) * step  # the last cells may be cut
+    area = np.zeros(whole)
+    area[: drivable.shape[0], : drivable.shape[1]] = drivable
+    area = area[step // 2 :: step, step // 2 :: step]
+    u = np.arange(area.shape[0])[:, None] * step * cell_m
+    v = np.arange(area.shape[1])[None, :] * step * cell_m
+
+    def mean(values: F64) -> F64:
+        return np.asarray(ndimage.uniform_filter(values, window, mode="constant"), dtype=np.float64)
+
+    total = np.maximum(mean(area), 1e-9)
+    mu, mv = mean(area * u) / total, mean(area * v) / total
+    uu, vv = mean(area * u * u) / total - mu * mu, mean(area * v * v) / total - mv * mv
+    uv = mean(area * u * v) / total - mu * mv
+    spread = np.maximum(uu + vv, 1e-9)
+    cosine = (uu - vv) / spread + _EGO_ROAD_WEIGHT * sm.cos(2.0 * road_heading_rad)
+    sine = 2.0 * uv / spread + _EGO_ROAD_WEIGHT * sm.sin(2.0 * road_heading_rad)
+    bend = 0.5 * np.asarray(wrap_angle(sm.arctan2(sine, cosine) - 2.0 * road_heading_rad), dtype=np.float64)
+    is_street = (np.abs(bend) < LARGEST_BEND_RAD) | (sm.hypot(uu - vv, 2.0 * uv) / spread > _LEAST_LONG)
+    heading = road_heading_rad + np.where(is_street, bend, 0.0)
+    return DrivableRegion(origin_m, cell_m, drivable, road_heading_rad, step, heading.astype(np.float32))
 
 
 def is_drivable(region: DrivableRegion, xy: Array) -> Bool:
@@ -248,10 +286,11 @@ def _road_heading(blocked: Bool, grid: _Grid) -> float:
     bins = int(2 * (_HEADING_REACH_M + 2.0) / _LATERAL_BIN_M)
     scores = np.empty(len(tried))
     for k, heading in enumerate(tried):
+        away = heading / _HEADING_SPREAD_RAD
         lateral = across * sm.cos(heading) - along * sm.sin(heading)
         count = np.bincount((lateral / _LATERAL_BIN_M + bins / 2).astype(np.int64), minlength=bins).astype(np.float64)
         near = sm.gaussian_filter(count, 2.0)  # wider than a cell, or the grid's own rows would line up best
-        scores[k] = (near * near).sum() * sm.exp(-0.5 * (heading / _HEADING_SPREAD_RAD) ** 2)
+        scores[k] = (near * near).sum() * sm.exp(-0.5 * away * away)
     best = int(np.argmax(scores))
     if 0 < best < len(tried) - 1:  # between the directions tried: the vertex of the parabola through the best three
         before, at, after = scores[best - 1 : best + 2]

@@ -10,6 +10,7 @@ Glossary. `T_a_b` maps coordinates in b to coordinates in a; letters that touch 
 Products are written out, not handed to BLAS, so that the same numbers come out on every processor.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -22,30 +23,49 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 
 _POLAR_STEPS = 8  # twice what a matrix a percent off needs
+_FEW = 1500  # numbers up to which one pass over rows is quicker than three over columns
 
 
 def transform_points(T_a_b: F64, points_b: Array) -> F64:
     """Map points (..., 3) by one matrix (4, 4), or by a stack (..., 4, 4) that broadcasts with them; float64."""
     T = np.asarray(T_a_b, dtype=np.float64)
-    p = np.asarray(points_b, dtype=np.float64)
-    x, y, z = p[..., 0], p[..., 1], p[..., 2]
-    return np.stack([T[..., i, 0] * x + T[..., i, 1] * y + T[..., i, 2] * z + T[..., i, 3] for i in range(3)], axis=-1)
+    out = _rotated(T, np.asarray(points_b, dtype=np.float64))
+    out += T[..., :3, 3]
+    return out
 
 
 def rotate_vectors(T_a_b: F64, vectors_b: Array) -> F64:
     """Rotate direction vectors (..., 3) by the rotation part of a matrix (..., 4, 4); float64."""
-    T = np.asarray(T_a_b, dtype=np.float64)
-    v = np.asarray(vectors_b, dtype=np.float64)
+    return _rotated(np.asarray(T_a_b, dtype=np.float64), np.asarray(vectors_b, dtype=np.float64))
+
+
+def _rotated(T: F64, v: F64) -> F64:
+    """Rotation parts times vectors, summed in the order of the columns, whichever way is quicker."""
+    if max(v.size, T.size) <= _FEW:
+        out = T[..., :3, 0] * v[..., 0, None]
+        out += T[..., :3, 1] * v[..., 1, None]
+        out += T[..., :3, 2] * v[..., 2, None]
+        return np.asarray(out)
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack([T[..., i, 0] * x + T[..., i, 1] * y + T[..., i, 2] * z for i in range(3)], axis=-1)
+    out = np.empty((3, *np.broadcast_shapes(v.shape[:-1], T.shape[:-2])))
+    for i in range(3):
+        np.multiply(T[..., i, 0], x, out=out[i])
+        out[i] += T[..., i, 1] * y
+        out[i] += T[..., i, 2] * z
+    return np.moveaxis(out, 0, -1)  # columns stay together: they are what is asked for next
 
 
 def compose(T_a_b: F64, T_b_c: F64) -> F64:
     """`T_a_c` of two (stacks of) rigid motions (..., 4, 4)."""
     A = np.asarray(T_a_b, dtype=np.float64)
     B = np.asarray(T_b_c, dtype=np.float64)
-    shape = np.broadcast_shapes(A.shape, B.shape)
-    out = np.zeros(shape, dtype=np.float64)
+    if max(A.size, B.size) <= _FEW:
+        out = A[..., :, 0, None] * B[..., None, 0, :]
+        out += A[..., :, 1, None] * B[..., None, 1, :]
+        out += A[..., :, 2, None] * B[..., None, 2, :]
+        out[..., 3] += A[..., :, 3]
+        return np.asarray(out)
+    out = np.zeros(np.broadcast_shapes(A.shape, B.shape))
     for i in range(3):
         for j in range(4):
             out[..., i, j] = A[..., i, 0] * B[..., 0, j] + A[..., i, 1] * B[..., 1, j] + A[..., i, 2] * B[..., 2, j]
@@ -87,7 +107,8 @@ def orthonormal(T: F64) -> F64:
 
 def _cofactors(R: F64) -> F64:
     """The transposed inverse of a matrix (3, 3) times its determinant."""
-    return np.stack([np.cross(R[1], R[2]), np.cross(R[2], R[0]), np.cross(R[0], R[1])])
+    next_, last = R[[1, 2, 0]], R[[2, 0, 1]]
+    return np.asarray(next_[:, [1, 2, 0]] * last[:, [2, 0, 1]] - next_[:, [2, 0, 1]] * last[:, [1, 2, 0]])
 
 
 def _sum3(values: F64) -> float:
@@ -109,7 +130,7 @@ def is_rigid(T: Array, tolerance: float = 1e-6) -> bool:
 
 def pose_from_xyz_yaw(x: float, y: float, z: float, yaw_rad: float) -> F64:
     """A pose (4, 4) turned by yaw about z, counter-clockwise from +x."""
-    c, s = sm.cos(yaw_rad), sm.sin(yaw_rad)
+    s, c = sm.sincos(float(yaw_rad))
     return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, z], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -117,10 +138,12 @@ def pose_on_slope(x: float, y: float, z: float, yaw_rad: float, normal: Array) -
     """A pose (4, 4) whose z axis is `normal` (3,) and whose x axis projects onto heading `yaw_rad` seen from above."""
     n = np.asarray(normal, dtype=np.float64)
     n = n / np.sqrt((n * n).sum())
-    heading = np.array([sm.cos(yaw_rad), sm.sin(yaw_rad), 0.0])
+    sine, cosine = sm.sincos(yaw_rad)
+    heading = np.array([cosine, sine, 0.0])
     heading[2] = -(n[0] * heading[0] + n[1] * heading[1]) / n[2]  # in the plane, same azimuth
     forward = heading / np.sqrt((heading * heading).sum())
-    return rigid(np.stack([forward, np.cross(n, forward), n], axis=1), np.array([x, y, z]))
+    left = n[[1, 2, 0]] * forward[[2, 0, 1]] - n[[2, 0, 1]] * forward[[1, 2, 0]]
+    return rigid(np.stack([forward, left, n], axis=1), np.array([x, y, z]))
 
 
 def yaw_of(T_a_b: Array) -> float:
@@ -152,22 +175,31 @@ def se3_log(T_a_b: F64) -> F64:
 
 def se3_exp(twist: F64, factor: Any = 1.0) -> F64:
     """Rigid motion(s) of `factor` times a twist (6,): a factor of shape S gives S + (4, 4). Constant-twist motion."""
-    v, w = np.asarray(twist[:3], dtype=np.float64), np.asarray(twist[3:], dtype=np.float64)
-    tau = np.asarray(factor, dtype=np.float64)
-    rate = float(np.sqrt((w * w).sum()))
-    angle = rate * tau
-    W = _cross_matrix(w)
-    WW = sm.product(W, W)
+    vx, vy, vz, wx, wy, wz = (float(value) for value in twist)
+    tau: Any = float(factor) if np.ndim(factor) == 0 else np.asarray(factor, dtype=np.float64)
+    rate = math.sqrt(wx * wx + wy * wy + wz * wz)
     if rate < 1e-9:
         a, b, c = tau, 0.5 * tau * tau, tau * tau * tau / 6.0
     else:
+        angle = rate * tau
         sine, cosine = sm.sincos(angle)
         a, b = sine / rate, (1.0 - cosine) / (rate * rate)
         c = (angle - sine) / (rate * rate * rate)
-        a, b, c = np.asarray(a), np.asarray(b), np.asarray(c)
+    # w x v, w x (w x v), and the square of w's cross product matrix
+    ux, uy, uz = wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx
+    qx, qy, qz = wy * uz - wz * uy, wz * ux - wx * uz, wx * uy - wy * ux
+    xy, xz, yz = wx * wy, wx * wz, wy * wz
+    rows = (
+        (1.0 - b * (wy * wy + wz * wz), b * xy - a * wz, b * xz + a * wy, tau * vx + b * ux + c * qx),
+        (b * xy + a * wz, 1.0 - b * (wx * wx + wz * wz), b * yz - a * wx, tau * vy + b * uy + c * qy),
+        (b * xz - a * wy, b * yz + a * wx, 1.0 - b * (wx * wx + wy * wy), tau * vz + b * uz + c * qz),
+    )
+    if isinstance(tau, float):
+        return np.array([*rows, (0.0, 0.0, 0.0, 1.0)])
     out = np.zeros(tau.shape + (4, 4), dtype=np.float64)
-    out[..., :3, :3] = np.eye(3) + a[..., None, None] * W + b[..., None, None] * WW
-    out[..., :3, 3] = tau[..., None] * v + b[..., None] * sm.product(W, v) + c[..., None] * sm.product(WW, v)
+    for i, row in enumerate(rows):
+        for j, value in enumerate(row):
+            out[..., i, j] = value
     out[..., 3, 3] = 1.0
     return out
 
@@ -192,7 +224,7 @@ def footprint_corners(box: Array, grow_m: float = 0.0) -> F64:
     """The four ground-plane corners (4, 2) of a contract box, counter-clockwise from front left."""
     x, y, yaw = float(box[0]), float(box[1]), float(box[6])
     half_l, half_w = float(box[3]) / 2.0 + grow_m, float(box[4]) / 2.0 + grow_m
-    c, s = sm.cos(yaw), sm.sin(yaw)
+    s, c = sm.sincos(yaw)
     local = np.array([[half_l, half_w], [-half_l, half_w], [-half_l, -half_w], [half_l, -half_w]])
     return np.stack([x + local[:, 0] * c - local[:, 1] * s, y + local[:, 0] * s + local[:, 1] * c], axis=1)
 

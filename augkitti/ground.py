@@ -12,7 +12,7 @@ from augkitti import same_math as sm
 from augkitti._bev_grid import cell_centres, cell_of, fill_smoothly, interpolate, mean_by_cell
 from augkitti.config import GroundConfig
 from augkitti.frames import F32, F64, Array
-from augkitti.scan_pair import Bool, GroundMap
+from augkitti.scan_pair import I32, Bool, GroundMap
 from augkitti.seeds import generator
 
 _RING_EDGES_M = np.array(
@@ -21,6 +21,7 @@ _RING_EDGES_M = np.array(
 _SECTORS = 72
 _BIN_M = 0.05  # of height histograms
 _SLOPE_MEMORY = 0.5  # of the new slope against that of the rings before
+STANDING_M = 0.1
 _STEEPEST = 0.25  # rise over run beyond which no ground is looked for
 
 
@@ -56,6 +57,11 @@ def fit_ground(xyz: F32, config: GroundConfig) -> GroundMap:
     )
 
 
+def standing_points(xyz: F32, ground: GroundMap) -> I32:
+    """Points (M,), ascending, that stand on the ground or hang over it: more than 0.1 m above."""
+    return np.flatnonzero(xyz[:, 2] - height_at(ground, xyz) > STANDING_M).astype(np.int32)
+
+
 def height_at(ground: GroundMap, xy: Array) -> F64:
     """Height z (M,) metres of the ground at places (M, 2): bilinear, held constant beyond the map's edge."""
     xy = np.atleast_2d(np.asarray(xy, dtype=np.float64))[:, :2]
@@ -86,7 +92,7 @@ def _fit_plane(p: F64, config: GroundConfig) -> F64:
     """
     r2 = p[:, 0] ** 2 + p[:, 1] ** 2
     lowest, highest = -config.max_height_m - 0.7, -config.min_height_m + 0.7
-    near = (r2 < config.plane_radius_m**2) & (p[:, 2] > lowest) & (p[:, 2] < highest)
+    near = (r2 < config.plane_radius_m * config.plane_radius_m) & (p[:, 2] > lowest) & (p[:, 2] < highest)
     q = p[near]
     cells = int(np.ceil(config.plane_radius_m / 0.5)) * 2
     flat, inside = cell_of(q, (-0.25 * cells, -0.25 * cells), 0.5, (cells, cells))

@@ -146,9 +146,11 @@ def find_sequences(root: Path) -> tuple[Sequence, ...]:
 
 def valid_rows(rows: Array) -> Bool:
     """Which rows (N, 4) of a scan file are measurements: finite, and not all zero (the contract's definition)."""
-    valid = (rows[:, 0] != 0.0) | (rows[:, 1] != 0.0) | (rows[:, 2] != 0.0) | (rows[:, 3] != 0.0)
+    valid = np.ones(len(rows), dtype=bool)
+    level = np.flatnonzero(rows[:, 2] == 0.0)  # few: only they can be all zero
+    valid[level] = (rows[level] != 0.0).any(axis=1)
     finite = np.isfinite(rows)
-    return np.asarray(valid if finite.all() else valid & finite.all(axis=1))
+    return valid if finite.all() else valid & np.asarray(finite.all(axis=1))
 
 
 def read_scan_rows(path: Path) -> Array:
@@ -462,7 +464,8 @@ def _rows_of(content: bytes, path: Path) -> Array:
 
 def _scan_of(rows: Array, sequence: Sequence, frame: int) -> Scan:
     path = sequence.scan_path(frame)
-    row = np.flatnonzero(valid_rows(rows)).astype(np.int32)
+    valid = valid_rows(rows)
+    row = np.arange(len(rows), dtype=np.int32) if valid.all() else np.flatnonzero(valid).astype(np.int32)
     kept = rows if len(row) == len(rows) else rows[row]
     if len(kept) < MIN_POINTS:
         raise InputError(path, f"holds {len(kept)} valid points, too few for a scan", _FETCH)
@@ -472,8 +475,10 @@ def _scan_of(rows: Array, sequence: Sequence, frame: int) -> Scan:
             path, "holds reflectance outside 0 to 1", "take KITTI's own scans, or divide by the full scale"
         )
     xyz = np.ascontiguousarray(kept[:, :3], dtype=np.float32)
-    quadrants = np.bincount((xyz[:, 0] > 0.0) * 2 + (xyz[:, 1] > 0.0), minlength=4)
-    if quadrants.min() < _MIN_QUADRANT_SHARE * len(xyz):
+    ahead, left = xyz[:, 0] > 0.0, xyz[:, 1] > 0.0
+    both = int(np.count_nonzero(ahead & left))
+    before, beside = int(np.count_nonzero(ahead)) - both, int(np.count_nonzero(left)) - both
+    if min(both, before, beside, len(xyz) - both - before - beside) < _MIN_QUADRANT_SHARE * len(xyz):
         raise InputError(
             path, "does not see all round: a camera-view crop?", "take the whole scans of the KITTI download"
         )
@@ -516,7 +521,9 @@ def _stamp(path: Path, frame: int) -> float | None:
     text = lines[frame].strip() if frame < len(lines) else ""
     try:
         whole, _, fraction = text.partition(".")
-        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        if len(whole) != len("2011-09-26 13:02:25"):
+            raise ValueError
+        moment = datetime.fromisoformat(whole).replace(tzinfo=UTC)
         return moment.timestamp() + float(f"0.{fraction or 0}")
     except ValueError as err:
         raise InputError(path, f"line {frame + 1}, of frame {frame}, holds no time: `{text}`", _FETCH) from err
@@ -569,23 +576,37 @@ def _rigid_of(R: Array, t: Array, where: str) -> F64:
 
 def _rigid_calib(path: Path) -> F64 | None:
     """The motion in one of the day's files of raw data (`R`, `T`); None where the file is missing."""
-    calib = _calib(path)
-    if calib is None:
-        return None
+    return _rigid_calib_of(path, _stat(path)) if path.is_file() else None
+
+
+@lru_cache(maxsize=64)
+def _rigid_calib_of(path: Path, stat: tuple[int, int]) -> F64:
+    calib = _calib(path) or {}
     R, t = _entry(calib, path, ("R",), 9), _entry(calib, path, ("T",), 3)
-    return _rigid_of(R, t, f"{path}: R")
+    return _kept(_rigid_of(R, t, f"{path}: R"))
 
 
 def _benchmark_T_velo_cam(path: Path) -> F64:
     """Rectified camera 0 to velo, from a tracking or object calibration file."""
-    calib = _calib(path)
-    if calib is None:
+    if not path.is_file():
         raise InputError(path, "is missing", "fetch the calibration that goes with the labels")
+    return _benchmark_T_velo_cam_of(path, _stat(path))
+
+
+@lru_cache(maxsize=64)
+def _benchmark_T_velo_cam_of(path: Path, stat: tuple[int, int]) -> F64:
+    calib = _calib(path) or {}
     tr = _entry(calib, path, ("Tr_velo_to_cam", "Tr_velo_cam"), 12).reshape(3, 4)
     rect = _entry(calib, path, ("R0_rect", "R_rect"), 9)
     T_unrectified_velo = _rigid_of(tr[:, :3], tr[:, 3], f"{path}: Tr_velo_to_cam")
     T_cam_unrectified = _rigid_of(rect, np.zeros(3), f"{path}: R0_rect")
-    return invert(compose(T_cam_unrectified, T_unrectified_velo))
+    return _kept(invert(compose(T_cam_unrectified, T_unrectified_velo)))
+
+
+def _kept(values: F64) -> F64:
+    """An array that is handed out more than once."""
+    values.setflags(write=False)
+    return values
 
 
 def _object_T_velo_cam(sequence: Sequence, frame: int) -> F64:
@@ -640,8 +661,7 @@ def _camera_azimuth(sequence: Sequence) -> tuple[float, float]:
         if focal <= 0.0 or width <= 0.0:
             raise InputError(path, "P_rect_02 or S_rect_02 is no camera", _FETCH)
         if T_cam0_velo is not None:
-            R_rect = _rigid_of(_entry(calib, path, ("R_rect_00",), 9), np.zeros(3), f"{path}: R_rect_00")
-            R_velo_cam = invert(compose(R_rect, T_cam0_velo))[:3, :3]
+            R_velo_cam = invert(compose(_R_rect(path, _stat(path)), T_cam0_velo))[:3, :3]
     elif sequence.tracking_calib is not None:
         tracking = _calib(sequence.tracking_calib) or {}
         P = _entry(tracking, sequence.tracking_calib, ("P2",), 12)
@@ -651,7 +671,12 @@ def _camera_azimuth(sequence: Sequence) -> tuple[float, float]:
         R_velo_cam = _benchmark_T_velo_cam(sequence.tracking_calib)[:3, :3]
     edges = [np.array([(column - centre) / focal, 0.0, 1.0]) for column in (width, 0.0)]
     right, left = (rotate_vectors(R_velo_cam, edge) for edge in edges)
-    return math.atan2(right[1], right[0]), math.atan2(left[1], left[0])
+    return sm.arctan2(right[1], right[0]), sm.arctan2(left[1], left[0])
+
+
+@lru_cache(maxsize=64)
+def _R_rect(path: Path, stat: tuple[int, int]) -> F64:
+    return _kept(_rigid_of(_entry(_calib(path) or {}, path, ("R_rect_00",), 9), np.zeros(3), f"{path}: R_rect_00"))
 
 
 def _pose_line(path: Path, frame: int) -> F64 | None:

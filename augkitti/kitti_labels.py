@@ -13,6 +13,7 @@ import numpy as np
 from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
+from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import F64, rotate_vectors, transform_points, wrap_angle
 from augkitti.scan_pair import LabelledBox
@@ -111,8 +112,9 @@ def _camera_box(category: str, words: list[str], T_velo_cam: F64, where: str) ->
     if min(height, width, length) <= 0.0:
         return None  # labelled in the image only
     centre = transform_points(T_velo_cam, np.array([x, y - height / 2.0, z]))
-    heading = rotate_vectors(T_velo_cam, np.array([math.cos(rotation_y), 0.0, -math.sin(rotation_y)]))
-    yaw = math.atan2(heading[1], heading[0])
+    s, c = sm.sincos(rotation_y)
+    heading = rotate_vectors(T_velo_cam, np.array([c, 0.0, -s]))
+    yaw = sm.arctan2(heading[1], heading[0])
     return np.array([*centre, length, width, height, yaw])
 
 

@@ -55,7 +55,7 @@ def label_points(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedSca
         if item.box0 is not None and (
             item.motion is None or abs(item.speed or 0.0) * pair_interval(pair) > _STANDING_M
         ):
-            near = _near(pair.scan0.xyz, item.box0, SHELL_M)
+            near = _near(pair.scan0.xyz.T, item.box0, SHELL_M)
             xyz, T_velo_box, size = pair.scan0.xyz[near], box_pose(item.box0), item.box0[3:6]
             shell = points_in_box(xyz, T_velo_box, size, SHELL_M) & ~points_in_box(xyz, T_velo_box, size)
             unknown0[near[shell & (instance0[near] < 0)]] = True
@@ -116,7 +116,7 @@ def _points_of(prepared: PreparedScan, boxes: list[F64 | None]) -> I16:
     for row, box in enumerate(boxes):
         if box is None:
             continue
-        near = _near(xyz, box, 0.0)
+        near = prepared.standing[_near(prepared.standing_xyz, box, 0.0)]
         near = near[points_in_box(xyz[near], box_pose(box), box[3:6])]
         above = xyz[near, 2] - height_at(prepared.ground, xyz[near, :2].astype(np.float64)) > ABOVE_GROUND_M
         near = near[above]
@@ -124,8 +124,8 @@ def _points_of(prepared: PreparedScan, boxes: list[F64 | None]) -> I16:
     return owner
 
 
-def _near(xyz: Array, box: F64, grow_m: float) -> npt.NDArray[np.intp]:
-    """Indices of the points (N, 3) in the upright square round a box, grown all round: a first, quick choice."""
+def _near(xy: Array, box: F64, grow_m: float) -> npt.NDArray[np.intp]:
+    """Indices of the points (2 or 3, N) in the upright square round a box, grown all round: a first, quick choice."""
     reach = float(sm.hypot(box[3] / 2.0 + grow_m, box[4] / 2.0 + grow_m)) + 0.01
-    near = np.flatnonzero(np.abs(xyz[:, 0] - float(box[0])) <= reach)
-    return np.asarray(near[np.abs(xyz[near, 1] - float(box[1])) <= reach])
+    near = np.flatnonzero(np.abs(xy[0] - float(box[0])) <= reach)
+    return np.asarray(near[np.abs(xy[1, near] - float(box[1])) <= reach])

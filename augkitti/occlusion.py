@@ -11,7 +11,7 @@ import numpy as np
 
 from augkitti.frames import F32, F64, Array
 from augkitti.scan_pair import I16, I32, NO_TICK, U8, U16, Bool, PreparedScan
-from augkitti.scanner import ScannerProfile, ray_lines
+from augkitti.scanner import ScannerProfile, lines_of_rays
 from augkitti.sensor_noise import CarReturns
 
 
@@ -37,11 +37,10 @@ class Occluded:
 
 def measured_range(prepared: PreparedScan, ray: I32, profile: ScannerProfile) -> F64:
     """Range (K,) metres along given rays of what the real scanner measured; inf where nothing returned."""
-    rays = prepared.rays
-    point = rays.ray_point[ray]
-    origin, direction = ray_lines(profile, rays.ray_ring[ray], rays.ray_azimuth_rad[ray], rays.ray_elevation_rad[ray])
-    along = ((prepared.scan.xyz[point].astype(np.float64) - origin) * direction).sum(axis=1)
-    return np.where(point >= 0, along, np.inf)
+    point = prepared.rays.ray_point[ray]
+    origin, direction = lines_of_rays(profile, prepared.rays, ray)
+    off = (prepared.scan.xyz[point].astype(np.float64) - origin) * direction
+    return np.where(point >= 0, off[:, 0] + off[:, 1] + off[:, 2], np.inf)
 
 
 def keep_nearest(prepared: PreparedScan, cars: Sequence[tuple[I32, CarReturns]], profile: ScannerProfile) -> Occluded:
@@ -75,7 +74,7 @@ _RETURN_FIELDS = ("returned", "range_m", "reflectance", "surface")
 def _points(prepared: PreparedScan, ray: I32, columns: list[Array], profile: ScannerProfile) -> SimulatedPoints:
     rays = prepared.rays
     range_m, reflectance, surface, car = columns or [np.zeros(0)] * 4
-    origin, direction = ray_lines(profile, rays.ray_ring[ray], rays.ray_azimuth_rad[ray], rays.ray_elevation_rad[ray])
+    origin, direction = lines_of_rays(profile, rays, ray)
     xyz = origin + range_m[:, None] * direction
     step = profile.coordinate_quantum_m
     if prepared.scan.kind == "raw":

@@ -5,16 +5,17 @@ region of both scans, then a few of them in full, against measured points, label
 virtual cars, at both moments and between. Nothing here casts a ray; whether a car gets enough returns is seen later.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
-from scipy import ndimage
 
 from augkitti import same_math as sm
 from augkitti.config import Config, PlacementConfig
-from augkitti.drivable import is_drivable
+from augkitti.drivable import LARGEST_BEND_RAD, is_drivable
 from augkitti.frames import (
+    F32,
     F64,
     Array,
     compose,
@@ -29,6 +30,7 @@ from augkitti.frames import (
 )
 from augkitti.ground import height_at
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
+from augkitti.raycast import bearings_of, box_corners, rays_between
 from augkitti.scan_pair import (
     Bool,
     CarModel,
@@ -45,15 +47,9 @@ from augkitti.vehicle_motion import Drive, bicycle_twist, draw_drive, drive_plan
 SEAM_RAD = np.deg2rad(15.0)  # contract: no car's azimuth span comes closer to straight behind
 _SEAM_MARGIN_RAD = np.deg2rad(0.5)
 _EGO_BOX = np.array([-0.45, 0.0, 0.0, 4.9, 1.9, 1.6, 0.0])  # KITTI's car round its scanner, seen from above
-_LOWEST_M, _TALLEST_M = 0.1, 4.0  # measured points lower or higher above the ground touch no car
 _TRACK_SHARE = 0.8  # wheels stand this far apart, in parts of the width (which has the mirrors in it)
 _STEEPEST = 0.2  # rise over run: cars stand on roads
-_ROAD_WINDOW_M = 7.0  # half of the window in which the region's long axis is the road
-_ROAD_CELL_M = 0.8  # coarse is fine enough for an axis
-_EGO_ROAD_WEIGHT = 0.15  # of the ego road's axis, against 1 for a line and 0 for a square
-_LARGEST_BEND_RAD = 0.7  # beyond it is a side street, if the region is long there
-_LEAST_LONG = 0.3
-_AZIMUTH_BINS = 1440
+_PLACES_AT_ONCE = 128
 _RETURNED = 0.7  # scanner.md section 3: share of body rays that return, mean over real cars
 
 
@@ -63,11 +59,8 @@ class SceneScan:
 
     prepared: PreparedScan
     middle_s: float
-    xyz: F64  # (M, 3) measured points that stand on the ground, velo at their own firing
-    time_s: F64  # (M,)
-    farthest_m: F64  # (rings, azimuth bins) measured range; infinite where a ray found nothing, 0 where it never can
-    ring_elevation_rad: F64  # (rings,)
-    boxes: F64  # (B, 7) labelled, in this scan
+    xyz: F32  # (3, M) measured points that stand on the ground, velo at their own firing
+    box_quads: F64  # (B, 4, 2) footprints of labelled boxes in this scan, grown by the gap
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +85,8 @@ def make_scene(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan,
     interval = pair.scan1.time_s - pair.scan0.time_s
     twist = ego_twist(pair.ego_motion, interval)
     scans = (
-        _scene_scan(prepared0, 0.0, raw, pair.labels0),
-        _scene_scan(prepared1, interval, raw, pair.labels1),
+        _scene_scan(prepared0, 0.0, pair.labels0, config.placement.box_gap_m),
+        _scene_scan(prepared1, interval, pair.labels1, config.placement.box_gap_m),
     )
     half = 0.5 * pair.scan0.period_s if raw else 0.0
     times = np.linspace(-half, interval + half, 9)
@@ -134,9 +127,10 @@ def propose_car(
     model = models[int(rng.integers(len(models)))]
     paint = float(rng.random())
     drive = draw_drive(model.wheelbase_m, must_move, config.motion, rng)
-    xy, yaw = _likely_places(scene, model, drive, config.placement, rng)
-    for place in range(min(len(xy), config.placement.full_checks)):
-        car = _stand(scene, model, drive, xy[place], float(yaw[place]), paint, config.placement)
+    taken = (_taken(scene, 0, others, config.placement), _taken(scene, 1, others, config.placement))
+    places = _likely_places(scene, taken, model, drive, config.placement, rng)
+    for xy, yaw in islice(places, config.placement.full_checks):
+        car = _stand(scene, model, drive, xy, yaw, paint, config.placement)
         if car is not None and has_room(scene, car, others, config):
             return car
     return None
@@ -168,7 +162,7 @@ def clear_of_seam(scene: PlacementScene, car: VirtualCar) -> bool:
     """Whether the car's corners keep 15 degrees from straight behind at both moments and between."""
     times = np.linspace(car.moment0_s, scene.interval_s + car.moment1_s, 7)
     T_scanner_car = compose(invert(T_world_scanner(scene.twist, times)), T_world_car(car, times))
-    corners = transform_points(T_scanner_car[:, None], _corners(car.model))
+    corners = transform_points(T_scanner_car[:, None], box_corners(car.model.size_m))
     from_behind = wrap_angle(sm.arctan2(corners[..., 1], corners[..., 0]) - np.pi)
     nearest = float(np.abs(from_behind).min())
     straddles = (
@@ -177,88 +171,33 @@ def clear_of_seam(scene: PlacementScene, car: VirtualCar) -> bool:
     return nearest > SEAM_RAD + _SEAM_MARGIN_RAD and not straddles
 
 
-def _scene_scan(prepared: PreparedScan, middle_s: float, rolling: bool, labels: Sequence[LabelledBox]) -> SceneScan:
-    scan, rays, ground = prepared.scan, prepared.rays, prepared.ground
-    above = scan.xyz[:, 2] - height_at(ground, scan.xyz[:, :2])
-    standing = np.flatnonzero((above > _LOWEST_M) & (above < _TALLEST_M))
-    xyz = scan.xyz[standing].astype(np.float64)
-    fired = rays.ray_time_s[rays.ray[standing]] if rolling else np.zeros(len(standing))
+def _scene_scan(prepared: PreparedScan, middle_s: float, labels: Sequence[LabelledBox], gap_m: float) -> SceneScan:
+    boxes = np.array([label.box for label in labels]).reshape(-1, 7)
     return SceneScan(
         prepared=prepared,
         middle_s=middle_s,
-        xyz=np.asfortranarray(xyz),  # searched by column
-        time_s=middle_s + fired,
-        farthest_m=_farthest(prepared),
-        ring_elevation_rad=_ring_elevation(prepared),
-        boxes=np.array([label.box for label in labels]).reshape(-1, 7),
+        xyz=prepared.standing_xyz,
+        box_quads=_footprints(boxes[:, :2], boxes[:, 6], boxes[:, 3:5], gap_m),
     )
-
-
-def _farthest(prepared: PreparedScan) -> F64:
-    rays, xyz = prepared.rays, prepared.scan.xyz
-    squared = xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1] + xyz[:, 2] * xyz[:, 2]
-    measured = np.append(np.sqrt(squared), np.float32(np.inf))  # index -1: nothing returned
-    reached = np.where(rays.ray_blind, np.float32(0.0), measured[rays.ray_point])
-    column = ((rays.ray_azimuth_rad + np.pi) * (_AZIMUTH_BINS / (2.0 * np.pi))).astype(np.int32) % _AZIMUTH_BINS
-    cell = rays.ray_ring.astype(np.int32) * _AZIMUTH_BINS + column
-    rings = int(rays.ray_ring.max(initial=0)) + 1
-    farthest = np.zeros(rings * _AZIMUTH_BINS, dtype=np.float32)
-    np.maximum.at(farthest, cell, reached)
-    return farthest.reshape(rings, _AZIMUTH_BINS).astype(np.float64)
-
-
-def _ring_elevation(prepared: PreparedScan) -> F64:
-    rays = prepared.rays
-    rings = int(rays.ray_ring.max(initial=0)) + 1
-    some = slice(None, None, 16)  # a mean over a few hundred rays of a ring is good to a thousandth of a degree
-    count = np.bincount(rays.ray_ring[some], minlength=rings)
-    total = np.bincount(rays.ray_ring[some], weights=rays.ray_elevation_rad[some], minlength=rings)
-    return np.asarray(total / np.maximum(count, 1))
 
 
 def _drivable_cells(region: DrivableRegion, config: PlacementConfig) -> tuple[F64, F64]:
     """Drivable cells (C, 2) within range and the road's heading (C,) at each."""
-    cells = np.argwhere(region.drivable)
-    xy = (cells + 0.5) * region.cell_m + np.asarray(region.origin_m)
-    r = sm.hypot(xy[:, 0], xy[:, 1])
+    row, column = np.divmod(np.flatnonzero(region.drivable), region.drivable.shape[1])
+    xy = np.stack(
+        [(at + 0.5) * region.cell_m + start for at, start in zip((row, column), region.origin_m, strict=True)]
+    )
+    r = sm.hypot(xy[0], xy[1])
     use = (r >= config.min_range_m) & (r <= config.max_range_m)
-    return xy[use], _road_headings(region, cells[use])
-
-
-def _road_headings(region: DrivableRegion, cells: Array) -> F64:
-    """Heading (C,) of the road at cells, within a right angle of the ego road's: the region's long axis round each.
-
-    Second moments of the region in a window; an axis and its opposite are one, hence doubled angles. Where the window
-    has no long axis (squares, junctions) the ego road's own heading stands.
-    """
-    step = max(1, round(_ROAD_CELL_M / region.cell_m))
-    window = 2 * int(_ROAD_WINDOW_M / (step * region.cell_m)) + 1
-    area = region.drivable[step // 2 :: step, step // 2 :: step].astype(np.float64)
-    u = np.arange(area.shape[0])[:, None] * step * region.cell_m
-    v = np.arange(area.shape[1])[None, :] * step * region.cell_m
-    row, column = np.minimum(cells // step, np.array(area.shape) - 1).T
-
-    def mean(values: F64) -> F64:
-        return np.asarray(ndimage.uniform_filter(values, window, mode="constant")[row, column], dtype=np.float64)
-
-    total = np.maximum(mean(area), 1e-9)
-    mu, mv = mean(area * u) / total, mean(area * v) / total
-    uu, vv = mean(area * u * u) / total - mu * mu, mean(area * v * v) / total - mv * mv
-    uv = mean(area * u * v) / total - mu * mv
-    spread = np.maximum(uu + vv, 1e-9)
-    ego = region.road_heading_rad
-    cosine = (uu - vv) / spread + _EGO_ROAD_WEIGHT * sm.cos(2.0 * ego)
-    sine = 2.0 * uv / spread + _EGO_ROAD_WEIGHT * sm.sin(2.0 * ego)
-    bend = 0.5 * np.asarray(wrap_angle(sm.arctan2(sine, cosine) - 2.0 * ego), dtype=np.float64)
-    is_street = (np.abs(bend) < _LARGEST_BEND_RAD) | (sm.hypot(uu - vv, 2.0 * uv) / spread > _LEAST_LONG)
-    return ego + np.where(is_street, bend, 0.0)
+    heading = region.heading_rad[row[use] // region.heading_cells, column[use] // region.heading_cells]
+    return np.ascontiguousarray(xy[:, use].T), heading.astype(np.float64)
 
 
 def _cell_chances(xy: F64, heading_rad: F64, road_heading_rad: float, config: PlacementConfig) -> dict[str, F64]:
     """Cumulated weights: distances evenly over where there is room, fewer on the wrong side and in side streets."""
     ring = np.floor(sm.hypot(xy[:, 0], xy[:, 1]) / 2.0).astype(np.int64)
     even = 1.0 / np.maximum(np.bincount(ring), 25)[ring] if len(xy) else np.zeros(0)
-    on_ego_road = np.abs(heading_rad - road_heading_rad) < _LARGEST_BEND_RAD
+    on_ego_road = np.abs(heading_rad - road_heading_rad) < LARGEST_BEND_RAD
     left = xy[:, 1] * sm.cos(road_heading_rad) - xy[:, 0] * sm.sin(road_heading_rad)
     anywhere = np.cumsum(even)
     return {
@@ -271,15 +210,27 @@ def _cell_chances(xy: F64, heading_rad: F64, road_heading_rad: float, config: Pl
     }
 
 
+def _taken(scene: PlacementScene, k: int, others: Sequence[VirtualCar], config: PlacementConfig) -> F64:
+    """Footprints (B, 4, 2) of labelled boxes and virtual cars, each at its own moment in scan k, grown by the gap."""
+    boxes = [car_box(car.model, car.pose1 if k else car.pose0) for car in others]
+    quads = [footprint_corners(box, config.box_gap_m)[None] for box in boxes]
+    return np.concatenate([scene.scans[k].box_quads, *quads])
+
+
 def _likely_places(
-    scene: PlacementScene, model: CarModel, drive: Drive, config: PlacementConfig, rng: np.random.Generator
-) -> tuple[F64, F64]:
-    """Places (M, 2) and yaws (M,) at the moment in scan 0 whose footprints lie on both regions, as if it were flat."""
+    scene: PlacementScene,
+    taken: tuple[F64, F64],
+    model: CarModel,
+    drive: Drive,
+    config: PlacementConfig,
+    rng: np.random.Generator,
+) -> Iterator[tuple[F64, float]]:
+    """Places (2,) and yaws at the moment in scan 0 whose footprints lie on both regions, as if it were flat."""
     chance = scene.cell_chance[drive.course]
     jitter = rng.random((config.candidates, 2)) - 0.5
     picks = rng.random(config.candidates)
     if not len(chance) or chance[-1] <= 0.0:
-        return np.zeros((0, 2)), np.zeros(0)
+        return
     cell = np.minimum(np.searchsorted(chance, picks * chance[-1]), len(chance) - 1)
     xy = scene.cell_xy[cell] + jitter * scene.scans[0].prepared.region.cell_m
     crossing = drive.course == "crossing"  # the ego road, not the side street that the car may stand in
@@ -288,13 +239,24 @@ def _likely_places(
     if scene.raw:
         behind = np.abs(wrap_angle(sm.arctan2(xy[:, 1], xy[:, 0]) - np.pi))
         xy, yaw = xy[behind > SEAM_RAD], yaw[behind > SEAM_RAD]
+    for start in range(0, len(xy), _PLACES_AT_ONCE):  # few are needed, as a rule
+        block = slice(start, start + _PLACES_AT_ONCE)
+        yield from zip(*_on_both_regions(scene, taken, model, drive, xy[block], yaw[block]), strict=True)
+
+
+def _on_both_regions(
+    scene: PlacementScene, taken: tuple[F64, F64], model: CarModel, drive: Drive, xy: F64, yaw: F64
+) -> tuple[F64, list[float]]:
     inside = _footprint_drivable(scene.scans[0].prepared, model, xy, yaw)
     xy, yaw = xy[inside], yaw[inside]
-    if not len(xy):
-        return xy, yaw
-    xy1, yaw1 = _planar_at_scan1(scene, model, drive, xy, yaw)
-    inside = _footprint_drivable(scene.scans[1].prepared, model, xy1, yaw1)
-    return xy[inside], yaw[inside]
+    free = ~_touches(_footprints(xy, yaw, model.size_m), taken[0])
+    xy, yaw = xy[free], yaw[free]
+    if len(xy):
+        xy1, yaw1 = _planar_at_scan1(scene, model, drive, xy, yaw)
+        inside = _footprint_drivable(scene.scans[1].prepared, model, xy1, yaw1)
+        inside &= ~_touches(_footprints(xy1, yaw1, model.size_m), taken[1])
+        xy, yaw = xy[inside], yaw[inside]
+    return xy, yaw.tolist()
 
 
 def _planar_at_scan1(scene: PlacementScene, model: CarModel, drive: Drive, xy: F64, yaw: F64) -> tuple[F64, F64]:
@@ -329,7 +291,7 @@ def _footprint_drivable(prepared: PreparedScan, model: CarModel, xy: F64, yaw: F
     along = np.linspace(-0.5, 0.5, int(np.ceil(length / spacing)) + 1) * length
     across = np.linspace(-0.5, 0.5, int(np.ceil(width / spacing)) + 1) * width
     grid = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
-    c, s = sm.cos(yaw)[:, None], sm.sin(yaw)[:, None]
+    s, c = (value[:, None] for value in sm.sincos(yaw))
     x = xy[:, :1] + c * grid[:, 0] - s * grid[:, 1]
     y = xy[:, 1:] + s * grid[:, 0] + c * grid[:, 1]
     inside = is_drivable(prepared.region, np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(x.shape)
@@ -396,7 +358,7 @@ def _pose_on_ground(
     and a moving one does not shake; the caller sees to it that neither map is left by more than `ground_gap_m`.
     """
     wheels = wheel_contacts(model)
-    c, s = sm.cos(yaw), sm.sin(yaw)
+    s, c = sm.sincos(yaw)
     at = xy + np.stack([c * wheels[:, 0] - s * wheels[:, 1], s * wheels[:, 0] + c * wheels[:, 1]], axis=1)
     here, there = scene.scans[k], scene.scans[1 - k]
     if not _is_observed(here.prepared.ground, at).any():  # far out beams lie farther apart than axles
@@ -441,7 +403,7 @@ def _clear_of_points(scene: PlacementScene, scan: SceneScan, car: VirtualCar, k:
     way = abs(car.speed_mps) * scene.interval_s
     ego_way = float(np.sqrt((scene.twist[:3] ** 2).sum())) * 0.25 * scan.prepared.scan.period_s
     near = _within(scan.xyz, pose[:2, 3], reach + 0.5 * way + ego_way)
-    xyz, time_s = scan.xyz[near], scan.time_s[near]
+    xyz, time_s = _points_and_times(scene, scan, near)
     if _any_in_car(transform_points(invert(pose), xyz), car.model, config):
         return False
     T_car_scanner = compose(invert(T_world_car(car, time_s)), T_world_scanner(scene.twist, time_s))
@@ -454,13 +416,21 @@ def _clear_of_points(scene: PlacementScene, scan: SceneScan, car: VirtualCar, k:
     )
     half_turn = 0.5 * scan.prepared.scan.period_s * float(np.abs(scene.twist[3:]).max()) * float(sm.hypot(*middle[:2]))
     near = _within(scan.xyz, middle, reach + 0.5 * way + 0.5 + 2.0 * ego_way + half_turn)
-    xyz_world = transform_points(T_world_scanner(scene.twist, scan.time_s[near]), scan.xyz[near])
+    xyz, time_s = _points_and_times(scene, scan, near)
+    xyz_world = transform_points(T_world_scanner(scene.twist, time_s), xyz)
     return not _any_in_car(transform_points(invert(T_world)[:, None], xyz_world), car.model, config)
 
 
-def _within(xyz: F64, centre: F64, radius_m: float) -> Array:
-    near = (np.abs(xyz[:, 0] - centre[0]) < radius_m) & (np.abs(xyz[:, 1] - centre[1]) < radius_m)
-    return np.flatnonzero(near)
+def _points_and_times(scene: PlacementScene, scan: SceneScan, which: Array) -> tuple[F64, F64]:
+    """Some of the scan's standing points (K, 3) and when they were measured (K,), from time0."""
+    rays = scan.prepared.rays
+    fired = rays.ray_time_s[rays.ray[scan.prepared.standing[which]]] if scene.raw else np.zeros(len(which))
+    return scan.xyz[:, which].T.astype(np.float64), scan.middle_s + fired
+
+
+def _within(xyz: F32, centre: F64, radius_m: float) -> Array:
+    near = np.flatnonzero(np.abs(xyz[0] - np.float32(centre[0])) < radius_m)
+    return np.asarray(near[np.abs(xyz[1, near] - centre[1]) < radius_m])
 
 
 def _any_in_car(xyz_car: F64, model: CarModel, config: PlacementConfig) -> bool:
@@ -474,24 +444,17 @@ def _any_in_car(xyz_car: F64, model: CarModel, config: PlacementConfig) -> bool:
 def _free_rays(scan: SceneScan, car: VirtualCar, k: int, config: Config) -> bool:
     """Whether enough of the rays towards the car's box reach it."""
     pose = car.pose1 if k else car.pose0
-    corners = transform_points(pose, _corners(car.model))
-    bearing = float(sm.arctan2(pose[1, 3], pose[0, 3]))
-    offset = wrap_angle(sm.arctan2(corners[:, 1], corners[:, 0]) - bearing)
-    centre = (bearing + np.pi) / (2.0 * np.pi) * _AZIMUTH_BINS
-    bins = _AZIMUTH_BINS / (2.0 * np.pi)
-    first, last = int(np.ceil(centre + offset.min() * bins)), int(np.floor(centre + offset.max() * bins))
+    corners = transform_points(pose, box_corners(car.model.size_m))
     distance = float(sm.hypot(pose[0, 3], pose[1, 3]))
-    low, high = float(corners[:, 2].min()), float(corners[:, 2].max())
-    rings = (scan.ring_elevation_rad > sm.arctan2(low + 0.1, distance)) & (
-        scan.ring_elevation_rad < sm.arctan2(high - 0.3, distance)
-    )
-    toward = scan.farthest_m[rings][:, np.arange(first, last + 1) % _AZIMUTH_BINS]
-    free = toward > float(np.sqrt((corners * corners).sum(axis=1)).min())
-    if not free.size:
-        return False
-    rays_per_bin = len(scan.prepared.rays) / (scan.farthest_m.size)
-    enough = free.sum() * rays_per_bin * _RETURNED >= config.min_points
-    return bool(enough and free.mean() >= config.placement.min_free_share)
+    low, high = float(corners[:, 2].min()) + 0.1, float(corners[:, 2].max()) - 0.3  # not its very edges
+    rays = scan.prepared.rays
+    elevations = float(sm.arctan2(low, distance)), float(sm.arctan2(high, distance))
+    toward = rays_between(rays, bearings_of(corners), elevations)
+    point = rays.ray_point[toward]
+    squared = (scan.prepared.scan.xyz[point] ** 2).sum(axis=1)
+    passes = (point < 0) | (squared > (corners * corners).sum(axis=1).min())
+    free = int(np.count_nonzero(passes & ~rays.ray_blind[toward]))
+    return free * _RETURNED >= config.min_points and free >= config.placement.min_free_share * len(toward)
 
 
 def _clear_of_boxes(
@@ -501,17 +464,11 @@ def _clear_of_boxes(
     mine = _quads(T_world_car(car, times), car.model.size_m[:2], 0.0)
     theirs = [scene.label_quads, scene.ego_quads]
     theirs += [_quads(T_world_car(c, times), c.model.size_m[:2], config.box_gap_m)[None] for c in others]
-    if _quads_overlap(mine, np.concatenate(theirs)):
+    if _overlap(mine, np.concatenate(theirs)).any():
         return False
-    for k, scan in enumerate(scene.scans):  # as the contract lists them: each in the frame of its own moment
-        listed = (
-            np.concatenate([scan.boxes, [car_box(c.model, c.pose1 if k else c.pose0) for c in others]])
-            if others
-            else scan.boxes
-        )
-        corners = footprint_corners(car_box(car.model, car.pose1 if k else car.pose0))
-        quads = np.array([footprint_corners(box, config.box_gap_m) for box in listed]).reshape(-1, 4, 2)
-        if _quads_overlap(corners, quads):
+    for k, pose in enumerate((car.pose0, car.pose1)):  # as the contract lists them: each in the frame of its own moment
+        corners = footprint_corners(car_box(car.model, pose))
+        if _touches(corners[None], _taken(scene, k, others, config)).any():
             return False
     return True
 
@@ -544,7 +501,7 @@ def _label_quads(pair: ScanPair, twist: F64, times: F64, rolling: bool, gap_m: f
 
 
 def _planar_pose(box: F64) -> F64:
-    c, s = sm.cos(box[6]), sm.sin(box[6])
+    s, c = sm.sincos(float(box[6]))
     return np.array([[c, -s, 0.0, box[0]], [s, c, 0.0, box[1]], [0.0, 0.0, 1.0, box[2]], [0.0, 0.0, 0.0, 1.0]])
 
 
@@ -555,24 +512,28 @@ def _quads(T_world_box: F64, length_width_m: F64, gap_m: float) -> F64:
     return transform_points(T_world_box[..., None, :, :], corners)[..., :2]
 
 
-def _quads_overlap(mine: F64, theirs: F64) -> bool:
-    """Whether a quadrilateral (..., 4, 2) touches any of (B, ..., 4, 2), by the separating axis theorem."""
-    if not len(theirs):
-        return False
-    mine = np.broadcast_to(mine, theirs.shape)
-    apart = np.zeros(theirs.shape[:-2], dtype=bool)
+def _footprints(xy: F64, yaw: F64, length_width_m: Array, gap_m: float = 0.0) -> F64:
+    """Footprints (M, 4, 2) of boxes at places (M, 2) and yaws (M,), of one size or of (M, 2), grown by the gap."""
+    half = 0.5 * np.asarray(length_width_m, dtype=np.float64)[..., None, :2] + gap_m
+    local = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * half
+    sine, cosine = (value[:, None] for value in sm.sincos(yaw))
+    x = xy[:, :1] + cosine * local[..., 0] - sine * local[..., 1]
+    return np.stack([x, xy[:, 1:] + sine * local[..., 0] + cosine * local[..., 1]], axis=-1)
+
+
+def _touches(mine: F64, theirs: F64) -> Bool:
+    """Which quadrilaterals (M, 4, 2) touch any of (B, 4, 2)."""
+    return np.asarray(_overlap(mine[:, None], theirs).any(axis=1))
+
+
+def _overlap(mine: F64, theirs: F64) -> Bool:
+    """Whether parallelograms (..., 4, 2) touch others that broadcast with them, by the separating axis theorem."""
+    apart = np.zeros(np.broadcast_shapes(mine.shape[:-2], theirs.shape[:-2]), dtype=bool)
     for quad in (mine, theirs):
-        edges = np.roll(quad, -1, axis=-2) - quad
-        for edge in range(2):  # opposite sides are parallel
-            nx, ny = -edges[..., edge, 1, None], edges[..., edge, 0, None]
+        for first in (0, 1):  # opposite sides are parallel
+            edge = quad[..., first + 1, :] - quad[..., first, :]
+            nx, ny = -edge[..., 1, None], edge[..., 0, None]
             a = nx * mine[..., 0] + ny * mine[..., 1]
             b = nx * theirs[..., 0] + ny * theirs[..., 1]
             apart |= (a.max(-1) < b.min(-1)) | (b.max(-1) < a.min(-1))
-    return bool((~apart).any())
-
-
-def _corners(model: CarModel) -> F64:
-    """The eight corners (8, 3) of a car's box, car frame."""
-    half = 0.5 * model.size_m
-    signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    return signs * half
+    return np.asarray(~apart)

@@ -10,18 +10,21 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from augkitti import same_math as sm
 from augkitti.frames import F64, Array, invert, rotate_vectors, transform_points, wrap_angle
 from augkitti.scan_pair import GLASS, I32, MEASURED, U8, CarModel, ScanRays
-from augkitti.scanner import ScannerProfile, ray_lines
+from augkitti.scanner import ScannerProfile, lines_of_rays
 
 MAX_LAYERS = 6  # both panes modelled twice, a head-rest between, and the far door
 _STEP_M = 1e-4  # past a hit before the next query: above float32 resolution at car size, below any pane's thickness
 _SAME_PANE_M = 0.03  # two layers of one pane: counted once
 _GRAZING = 1e-4  # cosine below which a ray runs along its triangle
+_WITHIN_RING_RAD = 5e-3  # scanner.md: elevations of compensated scans stay within 0.1 degrees of their beam
+_SIGNS = np.array([[i, j, k] for i in (-1.0, 1.0) for j in (-1.0, 1.0) for k in (-1.0, 1.0)])
 _START_BEFORE_M = 0.5  # rays start this far before the car, so that float32 keeps micrometres
 
 
@@ -73,29 +76,56 @@ def _structure(model: CarModel) -> MeshCaster:
 def rays_near(rays: ScanRays, T_velo_car: F64, size_m: Array, grow_m: float) -> I32:
     """Indices of the rays whose bearing and elevation can meet a box of `size_m` at `T_velo_car`, grown all round."""
     half = np.asarray(size_m, dtype=np.float64) / 2.0 + grow_m
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.float64)
-    corners = transform_points(T_velo_car, signs * half)
+    corners = transform_points(T_velo_car, box_corners(2.0 * half))
     distance = sm.hypot(corners[:, 0], corners[:, 1])
-    centre = T_velo_car[:2, 3]
-    bearing = float(sm.arctan2(centre[1], centre[0]))
-    off = wrap_angle(sm.arctan2(corners[:, 1], corners[:, 0]) - bearing)
     near = float(np.abs(transform_points(invert(T_velo_car), np.zeros(3))[:2] / half[:2]).max())
     if near <= 1.0:  # the scanner stands over the box
         return np.arange(len(rays), dtype=np.int32)
     # Nearest approach of the footprint, not of its corners: a long side can come closer than both its ends.
-    closest = max(float(sm.hypot(*centre)) - float(sm.hypot(half[0], half[1])), 0.5)
-    low = sm.arctan2(corners[:, 2].min() - 0.25, np.where(corners[:, 2].min() < 0.25, closest, distance.max()))
-    high = sm.arctan2(corners[:, 2].max() - 0.1, np.where(corners[:, 2].max() > 0.1, closest, distance.max()))
+    closest = max(float(sm.hypot(*T_velo_car[:2, 3])) - float(sm.hypot(half[0], half[1])), 0.5)
+    low, high = float(corners[:, 2].min()) - 0.25, float(corners[:, 2].max()) - 0.1
+    lowest = float(sm.arctan2(low, closest if low < 0.0 else distance.max()))
+    highest = float(sm.arctan2(high, closest if high > 0.0 else distance.max()))
     margin = 0.03 / closest + 1e-3  # beams do not start at the frame's origin
-    from_rad, to_rad = bearing + float(off.min()) - margin, bearing + float(off.max()) + margin
-    azimuth = rays.ray_azimuth_rad  # in [-pi, pi): a window over the cut behind is two
-    if from_rad < -np.pi or to_rad >= np.pi:
-        inside = (azimuth >= float(wrap_angle(from_rad))) | (azimuth <= float(wrap_angle(to_rad)))
+    first, last = bearings_of(corners)
+    return rays_between(rays, (first - margin, last + margin), (lowest - margin, highest + margin))
+
+
+def box_corners(size_m: Array) -> F64:
+    """The eight corners (8, 3) of a box of `size_m` (length, width, height) about the origin."""
+    return np.asarray(0.5 * _SIGNS * size_m)
+
+
+def bearings_of(corners: F64) -> tuple[float, float]:
+    """From where to where (radians, the first in [-2 pi, pi)) points (K, 3) lie as seen from the scanner."""
+    middle = float(sm.arctan2(corners[:, 1].mean(), corners[:, 0].mean()))
+    off = wrap_angle(sm.arctan2(corners[:, 1], corners[:, 0]) - middle)
+    return middle + float(off.min()), middle + float(off.max())
+
+
+def rays_between(rays: ScanRays, bearing_rad: tuple[float, float], elevation_rad: tuple[float, float]) -> I32:
+    """Indices (K,), ascending, of the rays in a window of bearing and elevation."""
+    start = rays.ring_start
+    (first, last), (low, high) = bearing_rad, elevation_rad
+    there = start[:-1][np.diff(start) > 0]
+    of_ring = rays.ray_elevation_rad[there]  # within a ring it hardly changes
+    rings = np.flatnonzero((of_ring >= low - _WITHIN_RING_RAD) & (of_ring <= high + _WITHIN_RING_RAD))
+    bounds = np.append(there, start[-1])
+    chosen = [_in_window(rays, int(bounds[rings[0]]), int(bounds[rings[-1] + 1]), first, last)] if len(rings) else []
+    if start[-1] < len(rays):  # stray points have rays of their own
+        chosen.append(_in_window(rays, int(start[-1]), len(rays), first, last))
+    ray = np.concatenate([np.zeros(0, np.intp), *chosen])
+    elevation = rays.ray_elevation_rad[ray]
+    return np.asarray(ray[(elevation >= low) & (elevation <= high)], dtype=np.int32)
+
+
+def _in_window(rays: ScanRays, a: int, b: int, first: float, last: float) -> npt.NDArray[np.intp]:
+    azimuth = rays.ray_azimuth_rad[a:b]  # in [-pi, pi): a window over the cut behind is two
+    if first < -np.pi or last >= np.pi:
+        inside = (azimuth >= float(wrap_angle(first))) | (azimuth <= float(wrap_angle(last)))
     else:
-        inside = (azimuth >= from_rad) & (azimuth <= to_rad)
-    beside = np.flatnonzero(inside)
-    elevation = rays.ray_elevation_rad[beside]
-    return np.asarray(beside[(elevation >= low - margin) & (elevation <= high + margin)], dtype=np.int32)
+        inside = (azimuth >= first) & (azimuth <= last)
+    return a + np.flatnonzero(inside)
 
 
 def cast_car(
@@ -105,12 +135,7 @@ def cast_car(
 
     With `opaque_glass` a pane ends the ray like any other surface.
     """
-    origin, direction = ray_lines(
-        profile,
-        rays.ray_ring[candidates],
-        rays.ray_azimuth_rad[candidates],
-        rays.ray_elevation_rad[candidates],
-    )
+    origin, direction = lines_of_rays(profile, rays, candidates)
     return cast_mesh(
         model,
         candidates,

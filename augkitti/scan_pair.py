@@ -4,6 +4,7 @@ Field names follow the shard contract. N is the number of valid points of a scan
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from augkitti.frames import F32, F64
 Bool = npt.NDArray[np.bool_]
 I16 = npt.NDArray[np.int16]
 I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 
@@ -63,6 +65,12 @@ class ScanRays:
     def __len__(self) -> int:
         return len(self.ray_ring)
 
+    @cached_property
+    def ring_start(self) -> I64:
+        """Index of each ring's first ray, up to ring 255; the last entry is where rays of stray points begin."""
+        on_lattice = int(np.count_nonzero(self.ray_tick != NO_TICK)) or len(self)
+        return np.searchsorted(self.ray_ring[:on_lattice], np.arange(256)).astype(np.int64)
+
 
 @dataclass(frozen=True, eq=False)
 class GroundMap:
@@ -84,6 +92,8 @@ class DrivableRegion:
     cell_m: float
     drivable: Bool  # (rows along x, columns along y)
     road_heading_rad: float  # direction of the ego road at the ego car, near 0
+    heading_cells: int  # cells of `drivable` to a side of one cell of `heading_rad`
+    heading_rad: F32  # (rows, columns) of the road there, along the ego road rather than against it
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +104,12 @@ class PreparedScan:
     rays: ScanRays
     ground: GroundMap
     region: DrivableRegion
+    standing: I32  # (M,) ascending: points that stand on the ground or hang over it
+
+    @cached_property
+    def standing_xyz(self) -> F32:
+        """Coordinates (3, M) of the standing points, each a row of its own: they are searched by x, then by y."""
+        return np.stack([self.scan.xyz[:, axis].take(self.standing) for axis in range(3)])
 
 
 @dataclass(frozen=True, eq=False)

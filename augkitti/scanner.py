@@ -71,6 +71,18 @@ class ScannerProfile:
         return tick_azimuth(self, ring.astype(np.uint8), tick.astype(np.uint16))
 
     @cached_property
+    def lattice_cos_sin(self) -> tuple[F64, F64]:
+        """Cosine and sine (beams, lattice_size) of `lattice_azimuth_rad`."""
+        cosine, sine = sm.sincos(self.lattice_azimuth_rad)[::-1]
+        return cosine, sine
+
+    @cached_property
+    def elevation_cos_sin(self) -> tuple[F64, F64]:
+        """Cosine and sine (beams,) of the beams' elevations."""
+        cosine, sine = sm.sincos(self.elevation_rad)[::-1]
+        return cosine, sine
+
+    @cached_property
     def digest(self) -> str:
         """sha256 of the profile's content."""
         return hashlib.sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()
@@ -157,12 +169,34 @@ def profile_from_content(content: Any, where: str) -> ScannerProfile:
 
 def ray_lines(profile: ScannerProfile, ring: U8, azimuth_rad: F64, elevation_rad: F64) -> tuple[F64, F64]:
     """Origins (R, 3) metres and unit directions (R, 3) of rays, velo frame at each ray's own firing."""
-    cos_a, sin_a = sm.cos(azimuth_rad), sm.sin(azimuth_rad)
-    cos_e, sin_e = sm.cos(elevation_rad), sm.sin(elevation_rad)
+    sin_a, cos_a = sm.sincos(azimuth_rad)
+    sin_e, cos_e = sm.sincos(elevation_rad)
+    return _lines(profile, ring, cos_a, sin_a, cos_e, sin_e)
+
+
+def lines_of_rays(profile: ScannerProfile, rays: ScanRays, ray: I32) -> tuple[F64, F64]:
+    """Origins (K, 3) and unit directions (K, 3) of some rays of a scan: `ray_lines`, looked up on the lattice."""
+    ring, tick = rays.ray_ring[ray], rays.ray_tick[ray]
+    off = np.flatnonzero(tick == NO_TICK)
+    if len(off) == len(ray):
+        return ray_lines(profile, ring, rays.ray_azimuth_rad[ray], rays.ray_elevation_rad[ray])
+    at = ring.astype(np.int64) * profile.lattice_size + tick
+    if len(off):
+        at[off] = 0
+    cos_a, sin_a = (table.ravel()[at] for table in profile.lattice_cos_sin)
+    cos_e, sin_e = (table[ring] for table in profile.elevation_cos_sin)
+    if len(off):  # stray points have rays of their own
+        sin_a[off], cos_a[off] = sm.sincos(rays.ray_azimuth_rad[ray[off]])
+        sin_e[off], cos_e[off] = sm.sincos(rays.ray_elevation_rad[ray[off]])
+    return _lines(profile, ring, cos_a, sin_a, cos_e, sin_e)
+
+
+def _lines(profile: ScannerProfile, ring: U8, cos_a: F64, sin_a: F64, cos_e: F64, sin_e: F64) -> tuple[F64, F64]:
     side = profile.side_m[ring]
-    origin = np.stack([-side * sin_a, side * cos_a, profile.height_m[ring]], axis=-1)
-    direction = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
-    return origin, direction
+    origin, direction = np.empty((3, len(ring))), np.empty((3, len(ring)))
+    origin[0], origin[1], origin[2] = -side * sin_a, side * cos_a, profile.height_m[ring]
+    direction[0], direction[1], direction[2] = cos_e * cos_a, cos_e * sin_a, sin_e
+    return origin.T, direction.T  # columns stay together: they are what is asked for next
 
 
 def tick_azimuth(profile: ScannerProfile, ring: U8, tick: U16) -> F64:
@@ -191,11 +225,11 @@ def fire_rays(profile: ScannerProfile, fired_ticks: U16, period_s: float) -> Sca
         ray=np.zeros(0, np.int32),
         ray_ring=np.repeat(np.arange(profile.beams, dtype=np.uint8), len(fired)),
         ray_tick=np.tile(fired, profile.beams),
-        ray_azimuth_rad=profile.lattice_azimuth_rad[:, fired].reshape(-1),
+        ray_azimuth_rad=profile.lattice_azimuth_rad.take(fired, axis=1).reshape(-1),
         ray_elevation_rad=np.repeat(profile.elevation_rad, len(fired)),
         ray_time_s=np.tile(tick_time(profile, fired, period_s), profile.beams),
         ray_point=np.full(profile.beams * len(fired), -1, np.int32),
-        ray_blind=profile.blind[:, fired].reshape(-1),
+        ray_blind=profile.blind.take(fired, axis=1).reshape(-1),
     )
 
 
@@ -255,8 +289,7 @@ def assign_rays(scan: Scan, profile: ScannerProfile) -> ScanRays:
 
 def ray_distance(scan: Scan, rays: ScanRays, profile: ScannerProfile) -> F64:
     """Distance (N,) metres of each point from its ray: the rounding of coordinates, if all is right."""
-    r = rays.ray
-    origin, direction = ray_lines(profile, rays.ray_ring[r], rays.ray_azimuth_rad[r], rays.ray_elevation_rad[r])
+    origin, direction = lines_of_rays(profile, rays, rays.ray)
     offset = scan.xyz.astype(np.float64) - origin
     along = (offset * direction).sum(axis=1)
     return np.asarray(np.sqrt(((offset - along[:, None] * direction) ** 2).sum(axis=1)))

@@ -105,15 +105,27 @@ SCHEMA = pa.schema(
 )
 
 _FLAT = [field.name for field in SCHEMA if not pa.types.is_list(field.type)]
-# scanner.md section 6: these encodings write in half the bytes of plain ones and as fast
-_ENCODING = {
-    **{f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in ("xyz0", "xyz1", "flow0")},
-    **{f"{name}{k}.list.element": "DELTA_BINARY_PACKED" for name in ("source", "removed") for k in (0, 1)},
+# measured column by column with `benchmarks/encodings.py`
+_STORED = {
+    **dict.fromkeys(("xyz0", "xyz1", "flow0", "tick0", "tick1"), "BYTE_STREAM_SPLIT"),
+    **dict.fromkeys(("reflectance0", "reflectance1"), "RLE_DICTIONARY"),
+    **dict.fromkeys(("source0", "source1", "removed0", "removed1"), "BYTE_STREAM_SPLIT"),
+    **dict.fromkeys((f"{name}{k}" for name in ("ring", "instance", "surface") for k in (0, 1)), "PLAIN"),
+    "flow_status0": "PLAIN",
 }
-_DICTIONARY = [
-    *(f"{name}{k}.list.element" for name in ("reflectance", "ring", "tick", "instance", "surface") for k in (0, 1)),
-    "flow_status0.list.element",
-]
+
+
+def writer_options() -> dict[str, Any]:
+    """Encodings and compression of a shard, as `pyarrow.parquet` takes them; small columns are stored as they are."""
+    stored = {f"{name}.list.element": how for name, how in _STORED.items()}
+    dictionary = [path for path, encoding in stored.items() if encoding == "RLE_DICTIONARY"]
+    return {
+        "use_dictionary": dictionary,
+        "column_encoding": {path: encoding for path, encoding in stored.items() if path not in dictionary},
+        "compression": dict.fromkeys(stored, "zstd"),
+        "compression_level": dict.fromkeys(stored, 1),
+        "write_statistics": _FLAT,
+    }
 
 
 def shard_metadata(config: Config, profile: ScannerProfile, models: Iterable[CarModel]) -> dict[str, Any]:
@@ -150,10 +162,8 @@ def write_shard(path: Path, pairs: Iterable[AugmentedPair], metadata: Mapping[st
     seen: set[str] = set()
 
     def write(file: BinaryIO) -> None:
-        options = {"compression": "zstd", "compression_level": 1, "write_statistics": _FLAT}
-        encodings = {"use_dictionary": _DICTIONARY, "column_encoding": _ENCODING}
         sequence = None
-        with pq.ParquetWriter(file, schema, **options, **encodings) as writer:
+        with pq.ParquetWriter(file, schema, **writer_options()) as writer:
             for pair in pairs:
                 sequence = sequence or pair.sequence
                 if pair.pair_id in seen or pair.sequence != sequence:
@@ -328,7 +338,7 @@ def read_frames(path: Path) -> list[tuple[int, int]]:
 
 
 def _plain_columns(file: pq.ParquetFile, path: Path, names: list[str]) -> list[list[Any]]:
-    table = _read(path, lambda: file.read(columns=names))
+    table = _read(path, lambda: file.read(columns=names, use_threads=False))
     if any(table.column(name).null_count for name in names):
         raise InputError(path, f"holds a row without {' or '.join(names)}", "generate it again, or copy it again")
     try:

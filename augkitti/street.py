@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from augkitti import same_math as sm
 from augkitti import street_objects as objects
@@ -110,7 +111,7 @@ def build_street(rng: np.random.Generator, duration_s: float, pace: int) -> Stre
         pace: how the ego car drives, modulo 5: town speed, fast, turning off slowly, gathering speed, standing.
     """
     speed, acceleration = _pace(rng, duration_s, pace)
-    travel_m = speed * duration_s + 0.5 * acceleration * duration_s**2
+    travel_m = speed * duration_s + 0.5 * acceleration * duration_s * duration_s
     turns_off = pace % 5 == 2 and travel_m < 70.0  # a side street is no longer than that
     shape = _draw_shape(rng, travel_m, turns_off)
     ego = _ego_track(shape, rng, speed, acceleration, turns_off)
@@ -324,7 +325,7 @@ def _steered(path: F64) -> F64:
     mean = np.ones(2 * half + 1) / (2 * half + 1)
     for _ in range(2):
         padded = np.pad(path, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
-        path = np.stack([np.convolve(padded[:, i], mean, mode="valid") for i in range(2)], axis=1)
+        path = ndimage.correlate1d(padded, mean, axis=0)[half : half + len(path)]
     return path
 
 
@@ -667,7 +668,7 @@ def _moving(
 ) -> list[Body]:
     first, last = float(shape.s_m[0]) + 8.0, float(shape.s_m[-1]) - 8.0
     lane = 0.5 * shape.lane_m
-    ends = ego.start_m + ego.speed_mps * duration_s + 0.5 * ego.acceleration_mps2 * duration_s**2 - 20.0
+    ends = ego.start_m + ego.speed_mps * duration_s + 0.5 * ego.acceleration_mps2 * duration_s * duration_s - 20.0
     found: list[Body] = []
 
     def car(corners: Array, radius_m: float, start_m: float, speed: float, acceleration: float = 0.0) -> None:

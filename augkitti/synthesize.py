@@ -348,7 +348,7 @@ def _at_edges(
 def _along_ring(grid: tuple[int, int], correlation: float, rng: np.random.Generator) -> F64:
     """Standard normal values (R,), each ring a chain of its own with this correlation from firing to firing."""
     field = rng.standard_normal(grid)
-    field[:, 1:] *= np.sqrt(1.0 - correlation**2)
+    field[:, 1:] *= np.sqrt(1.0 - correlation * correlation)
     return np.asarray(lfilter([1.0], [1.0, -correlation], field, axis=1)).ravel()
 
 
@@ -426,7 +426,7 @@ def _write_oxts(folder: Path, street: Street, ego: EgoTruth, index: int, rng: np
         T = compose(scanner_poses(street, t + step * np.array([-1.0, 0.0, 1.0])), _T_VELO_IMU)
         position, R = T[:, :3, 3], T[1, :3, :3]
         velocity = (position[2] - position[0]) / (2.0 * step) + rng.normal(0.0, 0.01, 3)
-        acceleration = (position[2] - 2.0 * position[1] + position[0]) / step**2 + [0.0, 0.0, 9.81]
+        acceleration = (position[2] - 2.0 * position[1] + position[0]) / (step * step) + [0.0, 0.0, 9.81]
         rate = se3_log(compose(invert(T[0]), T[2]))[3:] / (2.0 * step) + rng.normal(0.0, 0.001, 3)
         yaw = float(sm.arctan2(R[1, 0], R[0, 0]))
         pitch = float(sm.arctan2(-R[2, 0], sm.hypot(R[0, 0], R[1, 0])))

@@ -64,13 +64,20 @@ def bicycle_twist(speed_mps: float, yaw_rate_rps: float, rear_axle_x_m: float) -
 
 def drive_planar(xy: F64, yaw_rad: F64, elapsed_s: F64, drive: Drive, rear_axle_x_m: float) -> tuple[F64, F64]:
     """Places (M, 2) and yaws (M,) of car frames after `elapsed_s` (M,), seen from above on level ground."""
-    forward = np.stack([sm.cos(yaw_rad), sm.sin(yaw_rad)], axis=-1)
+    forward = _unit(yaw_rad)
     turned = drive.yaw_rate_rps * elapsed_s
-    chord = drive.speed_mps * elapsed_s * np.sinc(turned / (2.0 * np.pi))
+    half = np.where(turned == 0.0, 1e-20, 0.5 * turned)
+    chord = drive.speed_mps * elapsed_s * (sm.sin(half) / half)
     along = yaw_rad + 0.5 * turned
-    rear = xy + rear_axle_x_m * forward + chord[:, None] * np.stack([sm.cos(along), sm.sin(along)], axis=-1)
+    rear = xy + rear_axle_x_m * forward + chord[:, None] * _unit(along)
     yaw = yaw_rad + turned
-    return rear - rear_axle_x_m * np.stack([sm.cos(yaw), sm.sin(yaw)], axis=-1), yaw
+    return rear - rear_axle_x_m * _unit(yaw), yaw
+
+
+def _unit(yaw_rad: F64) -> F64:
+    """Unit vectors (M, 2) along headings."""
+    sine, cosine = sm.sincos(yaw_rad)
+    return np.stack([cosine, sine], axis=-1)
 
 
 def _draw_speed(must_move: bool, config: MotionConfig, rng: np.random.Generator) -> float:

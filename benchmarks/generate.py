@@ -1,8 +1,9 @@
 """Speed of generation on prepared scans, beside a floor measured in the same run.
 
 Floor: read the two scans of a pair, and write the same row as Parquet with zstd level 1, plain encoding, nothing else.
-Ours: everything that a pair costs when its scans are prepared: digests, scans and cache read, cars placed and cast,
-noise, labels, the shard written with its fsync. Wall time of one process with one thread.
+Ours: everything that a pair costs when its scans are prepared: scans, digests and cache read, cars placed and cast,
+noise, labels, the row written. Both write shards of as many pairs, ours with its fsync. One process, one thread; the
+order of the two changes from round to round.
 
 Usage: python benchmarks/generate.py [KITTI_ROOT] [CAD_FOLDER]
 """
@@ -12,70 +13,191 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterator
+from functools import wraps
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 
-from augkitti import kitti, shards
-from augkitti.augmentation import augment_pair
+from augkitti import add_cars, augmentation, kitti, shards
+from augkitti.augmentation import augment_pair, prepare_scan
 from augkitti.cad_models import load_cad_folder
 from augkitti.config import Config
-from augkitti.scanner import load_profile
+from augkitti.scan_pair import AugmentedPair, CarModel
+from augkitti.scanner import ScannerProfile, load_profile
 from augkitti.seeds import pair_seed
 from pipelines.prepare import prepared_pair
 
-PAIRS_OF_A_SEQUENCE, ROUNDS = 6, 3
+PAIRS_OF_A_SEQUENCE, ROUNDS = 6, 5
+CONFIG = Config()
+PLAIN = {"use_dictionary": False, "write_statistics": False, "compression": "zstd", "compression_level": 1}
+STAGES = (
+    "label_points",
+    "make_scene",
+    "propose_car",
+    "cast_and_measure",
+    "keeps_its_shape",
+    "hides_what_is_behind",
+    "occlude_both",
+    "finish_pair",
+)
+
+
+class Clock:
+    """Seconds spent by name; a stage within another counts for both."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, its time counted under a name."""
+
+        @wraps(function)
+        def counted(*args: Any, **options: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return function(*args, **options)
+            finally:
+                self.seconds[name] += time.perf_counter() - start
+
+        return counted
+
+
+def ours(
+    sequence: kitti.Sequence,
+    round_: int,
+    models: tuple[CarModel, ...],
+    profile: ScannerProfile,
+    folder: Path,
+    clock: Clock,
+) -> tuple[list[AugmentedPair], int]:
+    """Write one shard as the program does; its pairs and its size."""
+    made: list[AugmentedPair] = []
+
+    def pairs() -> Iterator[AugmentedPair]:
+        for frame0, _ in sequence.pairs[:PAIRS_OF_A_SEQUENCE]:
+            seed, name = pair_seed(0, sequence.name, frame0, round_), f"{sequence.name}/{frame0}/{round_}"
+            pair, prepared, _ = clock.timed("read scans and cache", prepared_pair)(
+                sequence, frame0, profile, CONFIG, folder / "cache"
+            )
+            augment = clock.timed("place, cast, measure, label", augment_pair)
+            one = augment(pair, models, profile, CONFIG, seed, name, prepared)
+            if one is not None:
+                made.append(one)
+                yield one
+
+    path = folder / "ours.parquet"
+    clock.timed("ours", shards.write_shard)(path, pairs(), {})
+    return made, path.stat().st_size
+
+
+def floor(sequence: kitti.Sequence, made: list[AugmentedPair], folder: Path, clock: Clock) -> int:
+    """Read the scans of the pairs and write their rows plainly; the file's size."""
+    tables = [shards.to_table(pair) for pair in made]
+    path = folder / "floor.parquet"
+
+    def write() -> None:
+        with pq.ParquetWriter(path, tables[0].schema, **PLAIN) as writer:
+            for pair, table in zip(made, tables, strict=True):
+                for frame in (pair.frame0, pair.frame1):
+                    np.fromfile(sequence.scan_path(frame), dtype=np.float32).reshape(-1, 4)
+                writer.write_table(table)
+
+    clock.timed("floor", write)()
+    return path.stat().st_size
+
+
+def not_prepared(root: kitti.KittiRoot, profile: ScannerProfile) -> None:
+    """What `prepare` costs a scan and a pair."""
+    spent: dict[str, list[float]] = defaultdict(list)
+    for sequence in root.sequences:
+        for frame0, _ in sequence.pairs[:PAIRS_OF_A_SEQUENCE]:
+            scans = [kitti.read_scan(sequence, frame0 + k) for k in (0, 1)]
+            for scan in scans:
+                start = time.perf_counter()
+                prepare_scan(scan, profile, CONFIG)
+                spent["rays, ground, region, a scan"].append(time.perf_counter() - start)
+            start = time.perf_counter()
+            kitti.read_ego_motion(sequence, frame0, *scans)
+            spent["ego-motion, a pair"].append(time.perf_counter() - start)
+    print("not prepared, milliseconds (median, 10 to 90 %)")
+    for name, values in spent.items():
+        low, middle, high = 1e3 * np.quantile(values, [0.1, 0.5, 0.9])
+        print(f"  {name:36s} {middle:6.0f} ({low:.0f} to {high:.0f})")
 
 
 def main() -> None:
     root = kitti.open_root(Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/kitti"))
     cad = Path(sys.argv[2] if len(sys.argv) > 2 else "../shared/cad")
-    profile, config = load_profile(), Config()
-    models = load_cad_folder(cad, config.categories).models
-    spent: dict[str, list[float]] = defaultdict(list)
+    profile = load_profile()
+    models = load_cad_folder(cad, CONFIG.categories).models
+    stages = Clock()
+    for name in STAGES:
+        setattr(augmentation, name, stages.timed(name, getattr(augmentation, name)))
+    rays = [0]
+
+    def counting(*args: Any) -> Any:
+        rays[0] += len(args[3])
+        return cast_car(*args)
+
+    cast_car = stages.timed("cast_car", add_cars.cast_car)
+    add_cars.cast_car = counting
+    per_pair: dict[str, list[float]] = defaultdict(list)
     sizes: dict[str, list[int]] = defaultdict(list)
-    todo = [(s, frame0) for s in root.sequences for frame0, _ in s.pairs[:PAIRS_OF_A_SEQUENCE]]
+    pairs = 0
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-
-        def clock(name: str, since: float) -> float:
-            spent[name].append(1e3 * (time.perf_counter() - since))
-            return time.perf_counter()
-
         for round_ in range(ROUNDS + 1):
             if round_ == 1:  # round 0 fills the cache and starts the libraries
-                spent.clear()
-            for sequence, frame0 in todo:
-                start = time.perf_counter()
-                for frame in (frame0, frame0 + 1):
-                    np.fromfile(sequence.scan_path(frame), dtype=np.float32).reshape(-1, 4)
-                start = clock("floor: read two scans", start)
-                pair, prepared, _ = prepared_pair(sequence, frame0, profile, config, scratch / "cache")
-                start = clock("ours: read scans and cache", start)
-                seed, name = pair_seed(0, sequence.name, frame0, round_), f"{sequence.name}/{frame0}/{round_}"
-                made = augment_pair(pair, models, profile, config, seed, name, prepared)
-                start = clock("ours: place, cast, measure, label", start)
-                if made is None:
+                per_pair.clear()
+                stages.seconds.clear()
+                rays[0] = pairs = 0
+            for sequence in root.sequences:
+                if not sequence.pairs:
                     continue
-                shards.write_shard(scratch / "ours.parquet", [made], {})
-                start = clock("ours: write", start)
-                table = shards.to_table(made)
-                start = time.perf_counter()
-                plain = {"use_dictionary": False, "write_statistics": False}
-                pq.write_table(table, scratch / "floor.parquet", compression="zstd", compression_level=1, **plain)
-                clock("floor: write the row", start)
-                for which in ("ours", "floor"):
-                    sizes[which].append((scratch / f"{which}.parquet").stat().st_size)
-    print(f"{len(todo)} pairs, {ROUNDS} rounds; milliseconds a pair, mean (10 to 90 %)")
-    for name in sorted(spent):
-        low, high = np.quantile(spent[name], [0.1, 0.9])
-        print(f"  {name:36s} {np.mean(spent[name]):6.1f} ({low:.1f} to {high:.1f})")
-    ours, floor = (sum(float(np.mean(v)) for n, v in spent.items() if n.startswith(k)) for k in ("ours", "floor"))
-    print(f"  ours {ours:.0f}, floor {floor:.0f}: {ours / floor:.2f} times the floor")
-    print(f"  {1e3 / ours:.1f} pairs a second and core; a pair {np.mean(sizes['ours']) / 1e6:.2f} MB", end=", ")
-    print(f"plain {np.mean(sizes['floor']) / 1e6:.2f} MB", end="; ")
-    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
+                clock = Clock()
+                before = (
+                    floor(sequence, made, scratch, clock) if round_ % 2 and (made := _last.get(sequence.name)) else 0
+                )
+                made, size = ours(sequence, round_, models, profile, scratch, clock)
+                if not before:
+                    before = floor(sequence, made, scratch, clock)
+                _last[sequence.name] = made
+                pairs += len(made)
+                for name, seconds in clock.seconds.items():
+                    per_pair[name].append(1e3 * seconds / len(made))
+                sizes["ours"].append(size // len(made))
+                sizes["floor"].append(before // len(made))
+    _print(per_pair, stages, sizes, pairs, rays[0])
+    not_prepared(root, profile)
+
+
+_last: dict[str, list[AugmentedPair]] = {}
+
+
+def _print(per_pair: dict[str, list[float]], stages: Clock, sizes: dict[str, list[int]], pairs: int, rays: int) -> None:
+    print(f"{pairs} pairs, {ROUNDS} rounds; milliseconds a pair, mean over shards (10 to 90 %)")
+    for name in ("floor", "ours", "read scans and cache", "place, cast, measure, label"):
+        low, high = np.quantile(per_pair[name], [0.1, 0.9])
+        print(f"  {name:36s} {np.mean(per_pair[name]):6.1f} ({low:.1f} to {high:.1f})")
+    parts = ("read scans and cache", "place, cast, measure, label")
+    written = np.array(per_pair["ours"]) - sum(np.array(per_pair[name]) for name in parts)
+    low, high = np.quantile(written, [0.1, 0.9])
+    print(f"  {'write':36s} {written.mean():6.1f} ({low:.1f} to {high:.1f})")
+    for name in (*STAGES, "cast_car"):
+        print(f"    {name:34s} {1e3 * stages.seconds[name] / pairs:6.1f}")
+    ratio = np.array(per_pair["ours"]) / np.array(per_pair["floor"])
+    low, high = np.quantile(ratio, [0.1, 0.9])
+    whole = np.mean(per_pair["ours"]) / np.mean(per_pair["floor"])
+    print(
+        f"  ours {whole:.2f} times the floor; by shard {np.median(ratio):.2f} in the median ({low:.2f} to {high:.2f})"
+    )
+    print(f"  {1e3 / np.mean(per_pair['ours']):.1f} pairs a second and core")
+    print(f"  {rays / pairs:,.0f} rays cast a pair, {rays / stages.seconds['cast_car'] / 1e6:.2f} million a second")
+    print(f"  a pair {np.mean(sizes['ours']) / 1e6:.2f} MB, plain {np.mean(sizes['floor']) / 1e6:.2f} MB")
+    print(f"  peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
 
 
 if __name__ == "__main__":

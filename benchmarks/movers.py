@@ -17,11 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from augkitti.config import Config
+from augkitti.drivable import with_headings
 from augkitti.frames import box_pose, invert, points_in_box, se3_exp, se3_log, transform_points
-from augkitti.ground import fit_ground
+from augkitti.ground import fit_ground, standing_points
 from augkitti.kitti import open_root, read_pair
 from augkitti.movers import find_movers, find_suspects, moves
-from augkitti.scan_pair import DrivableRegion, PreparedScan
+from augkitti.scan_pair import PreparedScan
 from augkitti.scanner import assign_rays, azimuth_time, load_profile
 from augkitti.street import body_poses
 from augkitti.synthesize import drive_street, synthesize
@@ -30,8 +31,9 @@ MIN_MOTION_M, MIN_POINTS, REACH_M = 0.3, 10, 50.0
 
 
 def prepare(scan, profile, config):
-    nowhere = DrivableRegion((0.0, 0.0), 1.0, np.zeros((1, 1), bool), 0.0)
-    return PreparedScan(scan, assign_rays(scan, profile), fit_ground(scan.xyz, config.ground), nowhere)
+    nowhere = with_headings((0.0, 0.0), 1.0, np.zeros((1, 1), bool), 0.0)
+    ground = fit_ground(scan.xyz, config.ground)
+    return PreparedScan(scan, assign_rays(scan, profile), ground, nowhere, standing_points(scan.xyz, ground))
 
 
 def on_streets(root, seed, frames, config, profile, verbose):

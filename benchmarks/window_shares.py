@@ -89,7 +89,7 @@ def main() -> None:
             if not labels:
                 continue
             scan = kitti.read_scan(sequence, frame)
-            prepared = PreparedScan(scan, assign_rays(scan, PROFILE), None, None)
+            prepared = PreparedScan(scan, assign_rays(scan, PROFILE), None, None, None)
             for label in labels:
                 T, size = box_pose(label.box), label.box[3:6]
                 distance = float(np.hypot(*label.box[:2]))

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from augkitti.augmentation import augment_pair
-from augkitti.dataset_index import shard_entry
+from augkitti.dataset_index import INDEX_NAME, shard_entry
 from augkitti.errors import InputError, MachineError
 from augkitti.kitti import Sequence
 from augkitti.scan_pair import MEASURED, AugmentedPair, PreparedScan
@@ -94,7 +94,12 @@ def augment_shard(item: tuple[ShardPlan, Sequence], options: Options) -> ShardRo
 
 
 def _take_back(path: Path, options: Options) -> None:
-    """Remove what was written after the output folder had gone: a folder without a work folder is nobody's run."""
+    """Remove what was written after the output folder had gone: a folder without a work folder is nobody's run.
+
+    A finished data set is left as it is: the shard was made twice, and the run did not wait for this one.
+    """
+    if (options.out / INDEX_NAME).is_file():
+        return
     with suppress(OSError):
         path.unlink(missing_ok=True)
         path.parent.rmdir()

@@ -1,7 +1,7 @@
 """Stage 1, per scan: reads the source's scans and drive files, writes what depends on one scan alone to the cache.
 
 Reads: the planned pairs' `.bin` files, timestamps, OXTS, poses, calibration.
-Writes: `CACHE/prepared/<2 digits>/<digest>.npz`, one file a scan (rays, ground, drivable region) and one a pair
+Writes: `CACHE/prepared/<2 digits>/<digest>.arrays`, one file a scan (rays, ground, drivable region) and one a pair
 (ego-motion, unlabelled movers). A file's name is the digest of all that its content depends on: the scan's bytes and
 times, the sections of the configuration that matter, the scanner profile, the program. So neighbouring pairs, other
 seeds and other cars find what is there, and nothing stale is ever read. Pickle is never loaded; a damaged file is made
@@ -165,6 +165,9 @@ def _pack(prepared: PreparedScan) -> dict[str, Any]:
         "region_grid": np.array([*region.origin_m, region.cell_m, region.road_heading_rad]),
         "drivable_shape": np.array(region.drivable.shape),
         "drivable": np.packbits(region.drivable),
+        "heading_cells": np.array(region.heading_cells),
+        "heading_rad": region.heading_rad,
+        "standing": _packed_rows(prepared.standing, len(prepared.scan)),
     }
     if prepared.scan.kind == "raw":  # rays are fired ticks times beams, and the stray points' own
         on_lattice = rays.ray_tick != NO_TICK
@@ -203,18 +206,26 @@ def _unpack(packed: dict[str, Any], scan: Scan, profile: ScannerProfile) -> Prep
     )
     x, y, cell, heading = (float(value) for value in packed["region_grid"])
     rows, columns = (int(value) for value in packed["drivable_shape"])
-    return PreparedScan(
-        scan, rays, ground, DrivableRegion((x, y), cell, _bits(packed["drivable"], (rows, columns)), heading)
-    )
+    drivable = _bits(packed["drivable"], (rows, columns))
+    region = DrivableRegion((x, y), cell, drivable, heading, int(packed["heading_cells"]), packed["heading_rad"])
+    if any(
+        side * region.heading_cells < cells
+        for side, cells in zip(region.heading_rad.shape, drivable.shape, strict=True)
+    ):
+        raise ValueError("headings of another region")
+    standing = np.flatnonzero(_bits(packed["standing"], (len(scan),))).astype(np.int32)
+    return PreparedScan(scan, rays, ground, region, standing)
 
 
 def _raw_rays(packed: dict[str, Any], scan: Scan, profile: ScannerProfile) -> ScanRays:
     ring, tick, fired = packed["ring"], packed["tick"], packed["fired"]
     lattice = fire_rays(profile, fired, scan.period_s)
     stray = np.flatnonzero(tick == NO_TICK)
-    on_lattice = np.flatnonzero(tick != NO_TICK)
-    ray = np.empty(len(scan), dtype=np.int32)
-    ray[on_lattice] = ring[on_lattice].astype(np.int64) * len(fired) + np.searchsorted(fired, tick[on_lattice])
+    column = np.zeros(NO_TICK + 1, dtype=np.int32)
+    column[fired] = np.arange(len(fired))
+    ray = ring.astype(np.int32)
+    ray *= len(fired)
+    ray += column[tick]
     ray[stray] = len(lattice) + np.arange(len(stray))
     ray_point = np.full(len(lattice) + len(stray), -1, dtype=np.int32)
     ray_point[ray] = np.arange(len(scan), dtype=np.int32)
@@ -222,7 +233,7 @@ def _raw_rays(packed: dict[str, Any], scan: Scan, profile: ScannerProfile) -> Sc
     def joined(of_lattice: Any, of_stray: Any) -> Any:
         if len(of_stray) != len(stray):
             raise ValueError("stray rays and stray points differ in number")
-        return np.concatenate([of_lattice, of_stray])
+        return np.concatenate([of_lattice, of_stray]) if len(stray) else of_lattice
 
     return ScanRays(
         ring=ring,
@@ -259,8 +270,15 @@ def _compensated_rays(packed: dict[str, Any], scan: Scan) -> ScanRays:
     )
 
 
+def _packed_rows(rows: Any, count: int) -> Any:
+    """Ascending row numbers as one bit a row."""
+    chosen = np.zeros(count, dtype=bool)
+    chosen[rows] = True
+    return np.packbits(chosen)
+
+
 def _bits(packed: Any, shape: tuple[int, ...]) -> Any:
     count = int(np.prod(shape))
     if len(packed) != (count + 7) // 8:
         raise ValueError("bits of another size")
-    return np.unpackbits(packed, count=count).astype(bool).reshape(shape)
+    return np.unpackbits(packed, count=count).view(bool).reshape(shape)

@@ -60,8 +60,7 @@ def run_tasks(
             workers, ahead, weighed, here = min(jobs, max(1, len(items))), "2 * n_jobs", _weighed, str(os.getpid())
         else:
             client = stack.enter_context(_connected(scheduler))
-            waits = {"client": client, "wait_for_workers_timeout": WORKERS_COME_S}
-            stack.enter_context(parallel_config(backend="dask", **waits))
+            stack.enter_context(parallel_config(backend=_on_workers(client)))
             workers, ahead, weighed, here = -1, f"2 * n_jobs + {_AHEAD}", _on_worker, program_digest()
         bar = stack.enter_context(
             Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True), disable=quiet)
@@ -85,6 +84,17 @@ def run_tasks(
                 raise
             problem = "workers kept dying under one task, as happens when memory runs out or time is up"
             raise MachineError(str(scheduler), problem, "see docs/scale.md, then go on with --resume") from err
+
+
+def _on_workers(client: Any) -> Any:
+    """joblib's backend for Dask, but that a single worker, the first to come, is used: joblib would run tasks here."""
+    from joblib._dask import DaskDistributedBackend
+
+    class OnWorkers(DaskDistributedBackend):  # type: ignore[misc]
+        def effective_n_jobs(self, n_jobs: int) -> int:
+            return int(max(2, super().effective_n_jobs(n_jobs)))
+
+    return OnWorkers(client=client, wait_for_workers_timeout=WORKERS_COME_S)
 
 
 def check_scheduler(scheduler: str) -> None:

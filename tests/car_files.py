@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from augkitti.parametric_cars import parametric_cars
 from augkitti.scan_pair import GLASS, CarModel
 
 NAMES = {1: "m_a", 2: "m_b", 3: "m_c", 4: "m_d", 5: "m_e"}  # names that say nothing
@@ -30,3 +31,11 @@ def turn(axis: int, degrees: float) -> np.ndarray:
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
     R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
     return R
+
+
+def write_cars(folder: Path, *bodies: str) -> None:
+    """Write cars made in code into a folder, as `a.obj`, `b.obj`, ..."""
+    cars = {model.name: model for model in parametric_cars()}
+    folder.mkdir(parents=True)
+    for letter, body in zip("abcd", bodies or ("sedan", "city"), strict=False):
+        write_obj(cars[f"parametric_{body}"], folder / f"{letter}.obj", np.eye(3))

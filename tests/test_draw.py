@@ -7,8 +7,9 @@ import pytest
 from hand_made_pair import SIZE, make_pair
 from PIL import Image
 
+from augkitti.drivable import with_headings
 from augkitti.errors import InputError
-from augkitti.scan_pair import PAINT, CarModel, DrivableRegion, GroundMap
+from augkitti.scan_pair import PAINT, CarModel, GroundMap
 
 pytest.importorskip("matplotlib", reason="pictures need the extra `view`")
 from augkitti.draw import draw_pair, range_image
@@ -43,7 +44,7 @@ def near_colour(image, rgb, off=12):
 
 def test_a_pair_with_all_that_can_be_known_makes_a_picture(tmp_path):
     pair, source0, source1 = make_pair()
-    region = DrivableRegion((-40.0, -20.0), 0.5, np.ones((160, 80), bool), 0.0)
+    region = with_headings((-40.0, -20.0), 0.5, np.ones((160, 80), bool), 0.0)
     plane, height = np.array([0, 0, 1, 1.73]), np.full((120, 120), -1.73, np.float32)
     ground = GroundMap(plane, (-60.0, -60.0), 1.0, height, height < 0, np.zeros(len(source0), bool))
     path = tmp_path / "pair.png"

@@ -10,6 +10,7 @@ from tiny_drive import GROUND_Z_M, SCENE, TinyDrive, write_drive
 
 from augkitti import kitti
 from augkitti.frames import invert, se3_exp, transform_points
+from augkitti.ground import standing_points
 from augkitti.labelled_objects import label_points
 from augkitti.scan_pair import AugmentedScan, GroundMap, ObjectRecord, PreparedScan, Scan, ScanPair
 from augkitti.scanner import assign_rays, load_profile
@@ -34,7 +35,8 @@ def prepared(scan: Scan) -> PreparedScan:
     plane = np.array([0.0, 0.0, 1.0, -GROUND_Z_M])
     is_ground = scan.xyz[:, 2] < GROUND_Z_M + 0.05
     ground = GroundMap(plane, (-100.0, -100.0), 100.0, flat, np.ones((2, 2), bool), is_ground)
-    return PreparedScan(scan, assign_rays(scan, PROFILE), ground, None)  # type: ignore[arg-type]
+    standing = standing_points(scan.xyz, ground)
+    return PreparedScan(scan, assign_rays(scan, PROFILE), ground, None, standing)  # type: ignore[arg-type]
 
 
 def test_moving_and_parked_cars_get_their_speed_and_motion_from_their_boxes(pair: ScanPair) -> None:

@@ -5,11 +5,12 @@ import pytest
 from tiny_drive import SCENE, Body, write_drive
 
 from augkitti.config import Config, MoversConfig
+from augkitti.drivable import with_headings
 from augkitti.frames import box_pose, compose, points_in_box, pose_from_xyz_yaw
-from augkitti.ground import fit_ground
+from augkitti.ground import fit_ground, standing_points
 from augkitti.kitti import open_root, read_pair
 from augkitti.movers import find_movers, find_suspects, moves
-from augkitti.scan_pair import DrivableRegion, PreparedScan
+from augkitti.scan_pair import PreparedScan
 from augkitti.scanner import assign_rays, load_profile
 
 CONFIG = MoversConfig()
@@ -17,8 +18,9 @@ MOVING = Body("moving", 16.0, -3.0, 0.0, (4.0, 1.7, 1.5), speed_mps=9.0, reflect
 
 
 def prepared(scan):
-    nowhere = DrivableRegion((0.0, 0.0), 1.0, np.zeros((1, 1), bool), 0.0)
-    return PreparedScan(scan, assign_rays(scan, load_profile()), fit_ground(scan.xyz, Config().ground), nowhere)
+    nowhere = with_headings((0.0, 0.0), 1.0, np.zeros((1, 1), bool), 0.0)
+    ground = fit_ground(scan.xyz, Config().ground)
+    return PreparedScan(scan, assign_rays(scan, load_profile()), ground, nowhere, standing_points(scan.xyz, ground))
 
 
 def drive(folder, moving, **options):

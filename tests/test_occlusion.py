@@ -24,7 +24,7 @@ def wall() -> PreparedScan:
     n = len(order)
     xyz = np.round(xyz[order], 3).astype(np.float32)
     scan = Scan(xyz, np.full(n, 0.3, np.float32), np.arange(n, dtype=np.int32), n, "raw", 0.0, 0.1)
-    return PreparedScan(scan, scanner.assign_rays(scan, PROFILE), None, None)  # type: ignore[arg-type]
+    return PreparedScan(scan, scanner.assign_rays(scan, PROFILE), None, None, None)  # type: ignore[arg-type]
 
 
 def car(ray: I32, stop_m: float, returned: bool = True) -> tuple[I32, CarReturns]:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from augkitti.config import Config
+from augkitti.drivable import with_headings
 from augkitti.frames import (
     compose,
     footprint_corners,
@@ -21,12 +22,12 @@ from augkitti.frames import (
     wrap_angle,
     yaw_of,
 )
-from augkitti.ground import height_at
+from augkitti.ground import height_at, standing_points
 from augkitti.kitti import open_root, read_pair
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
 from augkitti.parametric_cars import parametric_cars
 from augkitti.placement import car_box, make_scene, propose_car, wheel_contacts
-from augkitti.scan_pair import DrivableRegion, GroundMap, LabelledBox, PreparedScan, Scan, ScanPair
+from augkitti.scan_pair import GroundMap, LabelledBox, PreparedScan, Scan, ScanPair
 from augkitti.scanner import assign_rays, azimuth_time, fire_rays, load_profile, ray_lines
 
 HEIGHT_M = 1.73
@@ -58,12 +59,14 @@ def street_pair(
     for middle, boxes in ((0.0, boxes0), (interval, boxes1)):
         scan, is_ground = scan_of(boxes, middle, twist, kind, rise)
         T_scanner_world = invert(T_world_scanner(twist, middle))
+        ground = plane_map(is_ground, rise, T_scanner_world, lift1_m if middle else 0.0)
         prepared.append(
             PreparedScan(
                 scan=scan,
                 rays=assign_rays(scan, PROFILE),
-                ground=plane_map(is_ground, rise, T_scanner_world, lift1_m if middle else 0.0),
+                ground=ground,
                 region=road_map(road_m, T_scanner_world),
+                standing=standing_points(scan.xyz, ground),
             )
         )
     pair = ScanPair(
@@ -128,7 +131,7 @@ def road_map(road_m, T_scanner_world):
     world = transform_points(invert(T_scanner_world), np.stack([x, y, 0.0 * x], axis=-1))
     x0, x1, y0, y1 = road_m
     free = (world[..., 0] > x0) & (world[..., 0] < x1) & (world[..., 1] > y0) & (world[..., 1] < y1)
-    return DrivableRegion((-65.0, -65.0), 0.2, free, yaw_of(T_scanner_world))
+    return with_headings((-65.0, -65.0), 0.2, free, yaw_of(T_scanner_world))
 
 
 @pytest.fixture(scope="module")
@@ -353,7 +356,9 @@ def test_cars_head_along_a_road_that_bends_away():
         centres = np.arange(-65.0, 65.0, 0.2) + 0.1
         x, y = np.meshgrid(centres, centres, indexing="ij")
         off_axis = np.where(x < 10.0, y, (y - 0.5 * (x - 10.0)) * np.cos(np.arctan(0.5)))
-        bent.append(replace(prepared, region=replace(prepared.region, drivable=np.abs(off_axis) < 4.0)))
+        region = prepared.region
+        bend = with_headings(region.origin_m, region.cell_m, np.abs(off_axis) < 4.0, region.road_heading_rad)
+        bent.append(replace(prepared, region=bend))
     config = Config.model_validate({"motion": {"turning_share": 0, "against_share": 0}})
     scene = make_scene(pair, bent[0], bent[1], config)
     far = [yaw_of(car.pose0) for car in proposals(scene, 40, config=config) if 20.0 < car.pose0[0, 3] < 45.0]

@@ -12,12 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from pair_rows import assert_among, rows_of
 
-from augkitti.errors import InputError
+from augkitti.errors import InputError, MachineError
 from pipelines import cache
+from pipelines.augment import augment_shard
 from pipelines.generate import generate
 from pipelines.lock import NAME, hold
-from pipelines.run import WORK, Options, read_options
+from pipelines.run import WORK, Options, open_run, read_options
 
 N = 6  # pairs, in two streets: two shards
 
@@ -42,9 +44,9 @@ def run(out: Path, store: Path, *words: str, limit: int | None = None) -> tuple[
     return done.returncode, "".join(told)
 
 
-def options_of(out: Path, store: Path) -> Options:
+def options_of(out: Path, store: Path, n: int = N) -> Options:
     usual = {"kitti": None, "cad": None, "seed": 0, "config": None, "profile": None, "stop_on_error": False}
-    return replace(read_options(out=out, n=N, cars=(1, 1), **usual), cache=store)
+    return replace(read_options(out=out, n=n, cars=(1, 1), **usual), cache=store)
 
 
 def resumed(out: Path, store: Path) -> dict[str, str]:
@@ -63,10 +65,15 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, store):
+def undisturbed(tmp_path_factory, store):
     out = tmp_path_factory.mktemp("made") / "aug"
     assert run(out, store) == (0, "")
-    return digests(out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def made(undisturbed):
+    return digests(undisturbed)
 
 
 def begun(out: Path, store: Path, *words: str) -> subprocess.Popen:
@@ -119,6 +126,17 @@ def test_an_output_folder_removed_under_a_run_ends_it_and_nothing_stands_in_its_
     assert "removed under the run" in told
     assert not out.exists()
     assert resumed(out, store) == made
+
+
+def test_a_task_that_outlives_its_run_takes_nothing_away(undisturbed, made, store, tmp_path):
+    out = tmp_path / "aug"
+    shutil.copytree(undisturbed, out)
+    options = options_of(out, store)
+    begun_twice = open_run(options)  # as when a worker seemed lost and its shard went to another
+    for shard in begun_twice.shards:
+        with pytest.raises(MachineError):
+            augment_shard((shard, begun_twice.sequences[shard.sequence]), options)
+    assert digests(out) == made
 
 
 def test_a_file_that_may_not_grow_ends_the_run_and_it_goes_on(made, store, tmp_path):
@@ -180,12 +198,18 @@ def test_where_locks_are_unknown_the_process_named_in_the_file_holds_while_it_li
         pass
 
 
+def test_a_smaller_set_of_streets_holds_the_same_pairs(undisturbed, store, tmp_path):
+    options = options_of(tmp_path / "aug", store, n=3)
+    assert generate(options, jobs=1, resume=False, dry_run=False) == 0
+    assert_among(rows_of(tmp_path / "aug"), rows_of(undisturbed), 3)
+
+
 # --- the cache's size -------------------------------------------------------------------------------------------------
 
 
 def filled(folder: Path) -> list[Path]:
     """Four files of 1 kB, the first used longest ago, streets of another week, and a file of somebody else."""
-    paths = [folder / "prepared" / "ab" / f"{k}.npz" for k in range(4)]
+    paths = [folder / "prepared" / "ab" / f"{k}.arrays" for k in range(4)]
     for path in [*paths, folder / "streets" / "0123456789abcdef" / "scan.bin", folder / "prepared" / "notes.txt"]:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(bytes(1000))

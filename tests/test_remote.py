@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from car_files import write_cars
 from tiny_drive import write_drive, write_odometry
 from typer.testing import CliRunner
 
@@ -69,6 +70,17 @@ def bucket(server, local):
 
 
 @pytest.fixture(scope="module")
+def cars(bucket, tmp_path_factory):
+    """A folder of two car models, and the same in the bucket."""
+    folder = tmp_path_factory.mktemp("cars") / "cad"
+    write_cars(folder)
+    for path in sorted(folder.iterdir()):
+        content = path.read_bytes()
+        replace_whole(as_path(f"{BUCKET}/cars/{path.name}"), lambda f, c=content: f.write(c))
+    return folder, f"{BUCKET}/cars"
+
+
+@pytest.fixture(scope="module")
 def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
@@ -99,13 +111,14 @@ def test_a_root_on_a_store_reads_as_the_local_one(local, bucket):
 
 
 def test_a_run_on_a_store_that_fails_every_tenth_request_gives_the_bytes_of_a_local_run(
-    local, bucket, server, run, tmp_path
+    local, bucket, cars, server, run, tmp_path
 ):
     common = ("--n", 3, "--cars", 1)
-    assert run("generate", "--kitti", local, "--out", tmp_path / "near", *common).exit_code == 0
+    near = run("generate", "--kitti", local, "--cad", cars[0], "--out", tmp_path / "near", *common)
+    assert near.exit_code == 0, near.output
     out = f"{BUCKET}/far"
     server(10)
-    made = run("generate", "--kitti", bucket, "--out", out, *common)
+    made = run("generate", "--kitti", bucket, "--cad", cars[1], "--out", out, *common)
     assert made.exit_code == 0, made.output
     split = run("split", out, "--ratios", 70, 0, 30)
     assert split.exit_code == 0, split.output

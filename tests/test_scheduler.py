@@ -104,6 +104,9 @@ def test_a_run_on_two_workers_of_which_one_is_killed_ends_with_the_bytes_of_a_lo
     assert generate(place, "near", "--resume", cache="cache2").wait(PATIENCE_S) == 0
     assert digests(place / "far") == digests(place / "near")
     assert not (place / "far" / WORK).exists()
+    alone = generate(place, "alone", "--scheduler", address)  # a single worker is left: joblib would run tasks here
+    assert alone.wait(PATIENCE_S) == 0, (place / "alone.log").read_text()
+    assert digests(place / "alone") == digests(place / "near")
 
 
 def digests(folder):

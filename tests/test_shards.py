@@ -3,6 +3,7 @@ import pickle
 import subprocess
 import sys
 from dataclasses import fields, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from pair_factory import make_pair, metadata, write_data_set
+from pair_factory import make_pair, metadata, write_data_set, write_whole_index
 
 import augkitti
-from augkitti.dataset_index import read_index
+from augkitti.dataset_index import read_index, shard_entry
 from augkitti.errors import InputError
 from augkitti.shards import (
     CONTRACT_VERSION,
@@ -34,6 +35,7 @@ from augkitti.shards import (
     write_shard,
 )
 from augkitti.splits import split_dataset
+from pipelines.plan import plan_shards, stream
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -128,11 +130,63 @@ def test_other_readers_see_the_same_values(shard, pairs):
     assert table.column("objects")[1].as_py()[2]["motion"] == pairs[1].objects[2].motion.reshape(-1).tolist()
 
 
-def test_big_columns_carry_no_statistics(shard):
+def column_chunks(shard):
+    """What the file says of the first row's columns, by name; lists without their `.list.element`."""
     group = pq.ParquetFile(shard).metadata.row_group(0)
-    columns = {group.column(i).path_in_schema: group.column(i) for i in range(group.num_columns)}
-    assert all(column.compression == "ZSTD" for column in columns.values())
-    assert not any(columns[f"{name}.list.element"].is_stats_set for name in ("xyz0", "flow0", "source1", "ring0"))
+    chunks = [group.column(i) for i in range(group.num_columns)]
+    return {chunk.path_in_schema.removesuffix(".list.element"): chunk for chunk in chunks}
+
+
+def test_big_columns_carry_no_statistics(shard):
+    columns = column_chunks(shard)
+    assert columns["pair_id"].is_stats_set
+    assert not any(columns[name].is_stats_set for name in ("xyz0", "flow0", "source1", "ring0"))
+
+
+@pytest.mark.parametrize(
+    ("names", "encoding"),
+    [
+        ("xyz0 xyz1 flow0 tick0 tick1 source0 source1 removed0 removed1", "BYTE_STREAM_SPLIT"),
+        ("reflectance0 reflectance1", "RLE_DICTIONARY"),
+        ("ring0 ring1 instance0 instance1 surface0 surface1 flow_status0", "PLAIN"),
+    ],
+)
+def test_columns_are_stored_as_measured(shard, names, encoding):
+    columns = column_chunks(shard)
+    for name in names.split():
+        plain = {"PLAIN"} if encoding == "RLE_DICTIONARY" else set()  # the dictionary itself
+        assert columns[name].compression == "ZSTD", name
+        assert set(columns[name].encodings) - {"RLE"} == {encoding, *plain}, name
+
+
+def test_small_columns_are_stored_as_they_are(shard):
+    columns = column_chunks(shard)
+    big = {name for name, chunk in columns.items() if chunk.compression == "ZSTD"}
+    per_point = {
+        f"{name}{k}" for name in ("reflectance", "ring", "tick", "source", "instance", "surface") for k in (0, 1)
+    }
+    assert big == per_point | {"xyz0", "xyz1", "flow0", "flow_status0", "removed0", "removed1"}
+    assert all(chunk.compression == "UNCOMPRESSED" for name, chunk in columns.items() if name not in big)
+
+
+@pytest.mark.parametrize("values", ["many", "one", "none", "extreme"])
+def test_stored_columns_come_back_bit_for_bit(tmp_path, values):
+    pair = make_pair_of_seven()
+    n = {"many": 70_000, "one": 1, "none": 0, "extreme": 4000}[values]
+    bits = np.random.default_rng(3)
+
+    def any_bits(name):
+        dtype, width = getattr(pair.scan0, name).dtype, 3 if name == "xyz" else 1
+        column = bits.integers(0, 256, n * width * dtype.itemsize, np.uint8).view(dtype)
+        if values == "extreme" and dtype.kind != "f":
+            column = np.where(np.arange(n) % 2, np.iinfo(dtype).max, np.iinfo(dtype).min).astype(dtype)
+        return column.reshape(-1, 3) if width == 3 else column
+
+    names = ("xyz", "reflectance", "ring", "tick", "source", "instance", "surface", "removed")
+    scans = [replace(pair.scan0, **{name: any_bits(name) for name in names}) for _ in (0, 1)]
+    pair = replace(pair, scan0=scans[0], scan1=scans[1], flow0=any_bits("xyz"), flow_status0=any_bits("ring"))
+    write_shard(tmp_path / "s.parquet", [pair], metadata())
+    assert same(read_pair(tmp_path / "s.parquet", 0), pair)
 
 
 def test_column_types_are_those_of_the_contract():
@@ -255,6 +309,48 @@ def test_data_set_is_a_sequence_of_pairs(folder):
         dataset[6]
     with pytest.raises(InputError, match="holds no pair"):
         dataset["2011_09_26_drive_9000_sync/7/0"]
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
+    """A set of a sequence as `pipelines.plan` lays it out, spares among its pairs; its names by shard."""
+    folder, pair = tmp_path_factory.mktemp("planned"), make_pair_of_seven()
+    frames = list(range(3, 200, 2))
+    names, entries = {}, []
+    for plan in plan_shards([(pair.sequence, len(frames))], 290, 5):
+        drawn = list(islice(stream(plan, frames, 5), plan.quota + 2))[2:]  # the first two could not be made
+        path = folder / "data" / f"{plan.name}.parquet"
+        write_shard(path, [replace(pair, pair_id=d.pair_id, frame0=d.frame0) for d in drawn], metadata())
+        entries.append(shard_entry(folder, path, pair.sequence, pair.recording, len(drawn)))
+        names[path] = [d.pair_id for d in drawn]
+    write_whole_index(folder, entries)
+    return folder, names
+
+
+def test_a_pair_is_found_by_its_name_in_few_shards(planned, monkeypatch):
+    folder, names = planned
+    opened = []
+    monkeypatch.setattr("augkitti.dataset.read_pair_ids", lambda path: opened.append(path) or names[path])
+    dataset = augkitti.open(folder)
+    assert len(names) == 12
+    assert any("/1000000" in name for here in names.values() for name in here)
+    for path, here in names.items():
+        for row, name in enumerate(here):
+            opened.clear()
+            assert dataset._place(name) == (path, row)
+            assert len(opened) <= 4
+    with pytest.raises(InputError, match="holds no pair"):
+        dataset[f"{dataset.shards[0].sequence}/4/0"]
+
+
+def test_a_pair_is_found_by_its_name_in_shards_of_any_order(planned):
+    folder, names = planned
+    dataset = augkitti.open(folder)
+    dataset.shards = dataset.shards[::-1]
+    for here in names.values():
+        assert dataset[here[-1]].pair_id == here[-1]
+    with pytest.raises(InputError, match="holds no pair"):
+        dataset[f"{dataset.shards[0].sequence}/odd"]
 
 
 def test_data_set_can_be_pickled(folder):
