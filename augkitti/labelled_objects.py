@@ -43,7 +43,8 @@ def label_points(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedSca
     ids0 = {label.id for label in pair.labels0}
     rows: list[tuple[LabelledBox | None, LabelledBox | None]] = [(a, by_id1.get(a.id)) for a in pair.labels0]
     rows += [(None, label) for label in pair.labels1 if label.id not in ids0]
-    objects = tuple(_object(pair, first, second) for first, second in rows)
+    twist = ego_twist(pair.ego_motion, pair_interval(pair))
+    objects = tuple(_object(pair, twist, first, second) for first, second in rows)
     boxes0 = [o.box0 for o in objects]
     instance0 = _points_of(prepared0, boxes0)
     instance1 = _points_of(prepared1, [o.box1 for o in objects])
@@ -67,7 +68,7 @@ def pair_interval(pair: ScanPair) -> float:
     return pair.scan1.time_s - pair.scan0.time_s
 
 
-def _object(pair: ScanPair, first: LabelledBox | None, second: LabelledBox | None) -> ObjectRecord:
+def _object(pair: ScanPair, twist: F64, first: LabelledBox | None, second: LabelledBox | None) -> ObjectRecord:
     named = first or second
     assert named is not None
     moment0 = _moment(pair.scan0.kind, first, pair.scan0.period_s)
@@ -85,7 +86,6 @@ def _object(pair: ScanPair, first: LabelledBox | None, second: LabelledBox | Non
         return item
     box1 = np.concatenate([second.box[:3], first.box[3:6], second.box[6:]])  # one body: one size
     T_velo0_box, T_velo1_box = box_pose(first.box), box_pose(box1)
-    twist = ego_twist(pair.ego_motion, pair_interval(pair))
     elapsed = pair_interval(pair) + moment1 - moment0
     T_world_box0 = compose(T_world_scanner(twist, moment0), T_velo0_box)
     T_world_box1 = compose(T_world_scanner(twist, pair_interval(pair) + moment1), T_velo1_box)

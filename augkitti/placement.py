@@ -7,7 +7,7 @@ virtual cars, at both moments and between. Nothing here casts a ray; whether a c
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 
@@ -49,7 +49,7 @@ _SEAM_MARGIN_RAD = np.deg2rad(0.5)
 _EGO_BOX = np.array([-0.45, 0.0, 0.0, 4.9, 1.9, 1.6, 0.0])  # KITTI's car round its scanner, seen from above
 _TRACK_SHARE = 0.8  # wheels stand this far apart, in parts of the width (which has the mirrors in it)
 _STEEPEST = 0.2  # rise over run: cars stand on roads
-_PLACES_AT_ONCE = 128
+_FIRST_PLACES, _PLACES_AT_ONCE = 48, 192
 _RETURNED = 0.7  # scanner.md section 3: share of body rays that return, mean over real cars
 
 
@@ -239,8 +239,9 @@ def _likely_places(
     if scene.raw:
         behind = np.abs(wrap_angle(sm.arctan2(xy[:, 1], xy[:, 0]) - np.pi))
         xy, yaw = xy[behind > SEAM_RAD], yaw[behind > SEAM_RAD]
-    for start in range(0, len(xy), _PLACES_AT_ONCE):  # few are needed, as a rule
-        block = slice(start, start + _PLACES_AT_ONCE)
+    bounds = [0, _FIRST_PLACES, *range(_PLACES_AT_ONCE, len(xy), _PLACES_AT_ONCE), len(xy)]
+    for start, end in pairwise(bounds):  # few are needed, as a rule
+        block = slice(start, end)
         yield from zip(*_on_both_regions(scene, taken, model, drive, xy[block], yaw[block]), strict=True)
 
 

@@ -122,8 +122,8 @@ def writer_options() -> dict[str, Any]:
     return {
         "use_dictionary": dictionary,
         "column_encoding": {path: encoding for path, encoding in stored.items() if path not in dictionary},
-        "compression": dict.fromkeys(stored, "zstd"),
-        "compression_level": dict.fromkeys(stored, 1),
+        "compression": {path: "lz4" if path.startswith("xyz") else "zstd" for path in stored},
+        "compression_level": {path: 1 for path in stored if not path.startswith("xyz")},
         "write_statistics": _FLAT,
     }
 

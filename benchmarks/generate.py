@@ -167,9 +167,9 @@ def main() -> None:
                 _last[sequence.name] = made
                 pairs += len(made)
                 for name, seconds in clock.seconds.items():
-                    per_pair[name].append(1e3 * seconds / len(made))
-                sizes["ours"].append(size // len(made))
-                sizes["floor"].append(before // len(made))
+                    per_pair[name] += [1e3 * seconds / len(made)] * len(made)
+                sizes["ours"] += [size // len(made)] * len(made)
+                sizes["floor"] += [before // len(made)] * len(made)
     _print(per_pair, stages, sizes, pairs, rays[0])
     not_prepared(root, profile)
 
@@ -178,7 +178,7 @@ _last: dict[str, list[AugmentedPair]] = {}
 
 
 def _print(per_pair: dict[str, list[float]], stages: Clock, sizes: dict[str, list[int]], pairs: int, rays: int) -> None:
-    print(f"{pairs} pairs, {ROUNDS} rounds; milliseconds a pair, mean over shards (10 to 90 %)")
+    print(f"{pairs} pairs, {ROUNDS} rounds; milliseconds a pair, mean (10 to 90 % over shards)")
     for name in ("floor", "ours", "read scans and cache", "place, cast, measure, label"):
         low, high = np.quantile(per_pair[name], [0.1, 0.9])
         print(f"  {name:36s} {np.mean(per_pair[name]):6.1f} ({low:.1f} to {high:.1f})")

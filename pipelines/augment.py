@@ -9,7 +9,8 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -113,11 +114,25 @@ def _pairs(
     totals: Counter[str],
     skipped: Counter[tuple[str, str]],
 ) -> Iterator[AugmentedPair]:
-    """The shard's pairs as they are made; counts what is in them and what was skipped on the way."""
-    frames = tuple(first for first, _ in sequence.pairs)
-    for candidate in stream(shard, frames, options.seed):
-        if totals["pairs"] == shard.quota:
-            return
+    """The shard's pairs as they are made; counts what is in them and what was skipped on the way.
+
+    They are the first of the stream that can be made: as many candidates as are wanting are tried in the order of their
+    frames, since neighbouring pairs share a scan, then as many as are still wanting.
+    """
+    candidates = stream(shard, tuple(first for first, _ in sequence.pairs), options.seed)
+    while batch := sorted(islice(candidates, shard.quota - totals["pairs"]), key=attrgetter("frame0")):
+        yield from _made(batch, sequence, options, totals, skipped)
+
+
+def _made(
+    batch: list[Candidate],
+    sequence: Sequence,
+    options: Options,
+    totals: Counter[str],
+    skipped: Counter[tuple[str, str]],
+) -> Iterator[AugmentedPair]:
+    """Those of a few candidates that can be made."""
+    for candidate in batch:
         try:
             made = make_pair(sequence, candidate, options)
         except InputError as err:

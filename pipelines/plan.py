@@ -12,7 +12,8 @@ Drawn once, before any scan is read, from names and numbers alone. How it works,
    then to seven eighths, so that spares are left in each, and to the brim when the round is nearly full.
 4. A shard has an endless-enough *stream* of candidates that depends on seed, drive and pool alone, not on `--n`: its
    pool in drawn order at variant r, then, as spares, the pool again and again at variant numbers from 1,000,000 on,
-   which no round reaches. The shard's pairs are the first `quota` candidates of the stream that can be made.
+   which no round reaches. The shard's pairs are the first `quota` candidates of the stream that can be made, in the
+   order in which they are made.
 
 Hence a pair's content does not depend on `--n` (its seed comes from drive, frame and variant), and the pairs of
 `--n 100` are among those of `--n 200`: quotas only grow with n, and the first 20 that can be made of a stream are among

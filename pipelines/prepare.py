@@ -107,16 +107,25 @@ def prepared_scan(
     """
     sections = _sections(config, "ground", "drivable")
     path = entry_path(cache_folder, ["scan", scan_digest(sequence, frame), sections, profile.digest])
+    if path in _recent:
+        return _recent[path], False
     scan = read_scan(sequence, frame)
-    content = load(path)
-    if content is not None:
-        try:
-            return _unpack(content, scan, profile), False
-        except (KeyError, ValueError, IndexError, TypeError):
-            pass  # damaged or foreign: made again below
-    prepared = prepare_scan(scan, profile, config)
-    store(path, _pack(prepared))
-    return prepared, True
+    content, made = load(path), False
+    try:
+        prepared = _unpack(content, scan, profile) if content is not None else None
+    except (KeyError, ValueError, IndexError, TypeError):
+        prepared = None  # damaged or foreign: made again
+    if prepared is None:
+        prepared, made = prepare_scan(scan, profile, config), True
+        store(path, _pack(prepared))
+    _recent[path] = prepared
+    while len(_recent) > _KEPT:
+        _recent.pop(next(iter(_recent)))
+    return prepared, made
+
+
+_KEPT = 2  # prepared scans in memory: the second scan of a pair is often the first of the next
+_recent: dict[Path, PreparedScan] = {}
 
 
 def prepared_pair(
