@@ -11,6 +11,7 @@ from augkitti.frames import (
     Array,
     compose,
     invert,
+    move_lines,
     points_in_box,
     pose_from_xyz_yaw,
     rotate_vectors,
@@ -20,7 +21,7 @@ from augkitti.labelled_objects import LabelledObjects, pair_interval
 from augkitti.occlusion import Occluded, keep_nearest, measured_range
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
 from augkitti.placement import car_box
-from augkitti.raycast import CarHits, bearings_of, box_corners, cast_car, cross_box, rays_near
+from augkitti.raycast import CarHits, bearings_of, box_corners, cast_mesh, cross_box, rays_near
 from augkitti.scan_pair import (
     I16,
     MEASURED,
@@ -40,7 +41,7 @@ from augkitti.sensor_noise import CarLook, CarReturns, simulate_returns
 _BODY_MIDDLE = (0.70, 0.25, 0.50)  # contract, invariant 8: share of length and width; of height from, to
 _OPEN_SHARE = 0.005  # half of what the contract allows: the sweep shears what is judged here in one moment
 _SHEAR_M = 0.24  # contract: 0.25 m; less the rounding of coordinates
-_NEAR_M = 0.3  # rays are tried this far round the car's box, beside what it moves within the sweep
+_NEAR_M = 0.05  # rays are tried this far round the car's box, beside what it moves within the sweep
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +85,20 @@ def cast_into_scan(
     times = rays.ray_time_s[near] if rolling else np.full(len(near), moment)
     moments, which = np.unique(times, return_inverse=True)
     T_car_scanner = compose(invert(T_world_car(car, start + moments)), T_world_scanner(twist, start + moments))
-    return cast_car(car.model, T_car_scanner[which], rays, near, profile, config.glass == "opaque")
+    origin, direction = lines_of_rays(profile, rays, near)
+    origin, direction = move_lines(T_car_scanner, which, origin, direction)
+    return cast_mesh(car.model, near, origin, direction, config.glass == "opaque")
 
 
 def _sweep_drift(car: VirtualCar, pose: F64, twist: F64, prepared: PreparedScan) -> float:
-    """How far the car and the scanner move against each other between its moment and its rays, at most (metres)."""
-    speed = abs(car.speed_mps) + float(np.sqrt((twist[:3] ** 2).sum()))
-    first, last = bearings_of(transform_points(pose, box_corners(car.model.size_m + 2.0 * _NEAR_M)))
-    share = min(0.25, (last - first) / (2.0 * np.pi))  # twice the half of the window: the drift widens it
-    return speed * prepared.scan.period_s * share
+    """How far the car and the scanner move against each other between its moment and its rays, at most (metres).
+
+    Rays that meet the car pass it within half of its window of bearings, and the drift itself widens that by less than
+    a third, at the speeds and distances of cars on roads.
+    """
+    speed = abs(car.speed_mps) + float(np.sqrt((twist[:3] * twist[:3]).sum()))
+    first, last = bearings_of(transform_points(pose, box_corners(car.model.size_m)))
+    return speed * prepared.scan.period_s * min(0.25, 0.65 * (last - first) / (2.0 * np.pi))
 
 
 def occlude_both(
@@ -212,25 +218,23 @@ def finish_pair(
 
 def _columns(prepared: PreparedScan, occluded: Occluded, instance: I16, first_car: int) -> AugmentedScan:
     scan, rays, new = prepared.scan, prepared.rays, occluded.simulated
-    kept = np.flatnonzero(occluded.kept)
+    edges = np.flatnonzero(np.diff(occluded.kept, prepend=False, append=False)).reshape(-1, 2)
+    kept = [slice(int(first), int(last)) for first, last in edges]  # a car hides runs of each ring
+    measured = sum(run.stop - run.start for run in kept)
+
+    def joined(column: Array, simulated: Array) -> Array:
+        return np.concatenate([*(column[run] for run in kept), simulated.astype(column.dtype, copy=False)])
+
     return AugmentedScan(
-        xyz=_joined(scan.xyz, kept, new.xyz),
-        reflectance=_joined(scan.reflectance, kept, new.reflectance),
-        ring=_joined(rays.ring, kept, new.ring),
-        tick=_joined(rays.tick, kept, new.tick),
-        source=_joined(scan.row, kept, np.full(len(new.xyz), -1, dtype=np.int32)),
-        instance=_joined(instance, kept, (new.car + first_car).astype(np.int16)),
-        surface=np.concatenate([np.full(len(kept), MEASURED, dtype=np.uint8), new.surface]),
+        xyz=joined(scan.xyz, new.xyz),
+        reflectance=joined(scan.reflectance, new.reflectance),
+        ring=joined(rays.ring, new.ring),
+        tick=joined(rays.tick, new.tick),
+        source=joined(scan.row, np.full(len(new.xyz), -1, dtype=np.int32)),
+        instance=joined(instance, new.car + first_car),
+        surface=np.concatenate([np.full(measured, MEASURED, dtype=np.uint8), new.surface]),
         removed=scan.row[~occluded.kept],
     )
-
-
-def _joined(measured: Array, kept: Array, simulated: Array) -> Array:
-    """The kept rows of a measured column, then the simulated ones."""
-    out = np.empty((len(kept) + len(simulated), *measured.shape[1:]), dtype=measured.dtype)
-    measured.take(kept, axis=0, out=out[: len(kept)], mode="clip")  # no buffer; all indices are in range
-    out[len(kept) :] = simulated
-    return out
 
 
 def _virtual_object(index: int, car: VirtualCar, cast: Cast, scan0: PreparedScan, scan1: PreparedScan) -> ObjectRecord:

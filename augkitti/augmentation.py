@@ -74,7 +74,7 @@ def augment_pair(
     for attempt in range(config.placement.attempts):
         if len(cars) == wanted:
             break
-        car = propose_car(scene, cars, models, must_move=not cars, config=config, rng=rng)  # place and motion
+        car = propose_car(scene, cars, models, not cars, occluded, config, rng)  # place and motion
         if car is None:
             continue
         cast = cast_and_measure(car, pair, scan0, scan1, profile, config, generator(seed, "look", attempt))

@@ -55,11 +55,24 @@ def _rotated(T: F64, v: F64) -> F64:
     return np.moveaxis(out, 0, -1)  # columns stay together: they are what is asked for next
 
 
+def move_lines(T_a_b: F64, which: Array, origin_b: F64, direction_b: F64) -> tuple[F64, F64]:
+    """Lines (K, 3), (K, 3) carried into a, each by one of few motions (M, 4, 4): its own is number `which` (K,)."""
+    origin, direction = np.empty((3, len(which))), np.empty((3, len(which)))
+    for i in range(3):
+        row = T_a_b[:, i].T.take(which, axis=1)
+        for out, vectors in ((origin[i], origin_b), (direction[i], direction_b)):
+            np.multiply(row[0], vectors[:, 0], out=out)
+            out += row[1] * vectors[:, 1]
+            out += row[2] * vectors[:, 2]
+        origin[i] += row[3]
+    return origin.T, direction.T
+
+
 def compose(T_a_b: F64, T_b_c: F64) -> F64:
     """`T_a_c` of two (stacks of) rigid motions (..., 4, 4)."""
     A = np.asarray(T_a_b, dtype=np.float64)
     B = np.asarray(T_b_c, dtype=np.float64)
-    if max(A.size, B.size) <= _FEW:
+    if max(A.size, B.size) <= 16 * _FEW:
         out = A[..., :, 0, None] * B[..., None, 0, :]
         out += A[..., :, 1, None] * B[..., None, 1, :]
         out += A[..., :, 2, None] * B[..., None, 2, :]

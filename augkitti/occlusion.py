@@ -25,6 +25,7 @@ class SimulatedPoints:
     tick: U16
     car: I16  # which of the cars
     surface: U8
+    ray: I32  # of the scan's rays, ascending
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,4 +87,5 @@ def _points(prepared: PreparedScan, ray: I32, columns: list[Array], profile: Sca
         tick=rays.ray_tick[ray],
         car=car.astype(np.int16),
         surface=surface.astype(np.uint8),
+        ray=ray,
     )

@@ -29,6 +29,7 @@ from augkitti.frames import (
     yaw_of,
 )
 from augkitti.ground import height_at
+from augkitti.occlusion import Occluded
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
 from augkitti.raycast import bearings_of, box_corners, rays_between
 from augkitti.scan_pair import (
@@ -111,6 +112,7 @@ def propose_car(
     others: Sequence[VirtualCar],
     models: Sequence[CarModel],
     must_move: bool,
+    occluded: tuple[Occluded, Occluded] | None,
     config: Config,
     rng: np.random.Generator,
 ) -> VirtualCar | None:
@@ -121,6 +123,7 @@ def propose_car(
         others: virtual cars already in the pair.
         models: the cars to draw from, each as likely.
         must_move: whether it moves at `config.motion.moving_mps` or more.
+        occluded: both scans with these in them, so that no car hides another whole; None without.
         config: limits and shares.
         rng: all chance comes from it; the number of draws depends on the scene.
     """
@@ -131,7 +134,7 @@ def propose_car(
     places = _likely_places(scene, taken, model, drive, config.placement, rng)
     for xy, yaw in islice(places, config.placement.full_checks):
         car = _stand(scene, model, drive, xy, yaw, paint, config.placement)
-        if car is not None and has_room(scene, car, others, config):
+        if car is not None and has_room(scene, car, others, occluded, config):
             return car
     return None
 
@@ -148,12 +151,18 @@ def wheel_contacts(model: CarModel) -> F64:
     return np.array([[front, side, under], [front, -side, under], [rear, side, under], [rear, -side, under]])
 
 
-def has_room(scene: PlacementScene, car: VirtualCar, others: Sequence[VirtualCar], config: Config) -> bool:
+def has_room(
+    scene: PlacementScene,
+    car: VirtualCar,
+    others: Sequence[VirtualCar],
+    occluded: tuple[Occluded, Occluded] | None,
+    config: Config,
+) -> bool:
     """Whether a car keeps clear of the seam, of all boxes and of all measured points, and can be seen."""
     return (
         (not scene.raw or clear_of_seam(scene, car))
         and _clear_of_boxes(scene, car, others, config.placement)
-        and all(_free_rays(scan, car, k, config) for k, scan in enumerate(scene.scans))
+        and all(_in_sight(scan, car, k, occluded and occluded[k], config) for k, scan in enumerate(scene.scans))
         and all(_clear_of_points(scene, scan, car, k, config.placement) for k, scan in enumerate(scene.scans))
     )
 
@@ -268,7 +277,7 @@ def _planar_at_scan1(scene: PlacementScene, model: CarModel, drive: Drive, xy: F
     xyz_world = transform_points(T_world_then, np.column_stack([xy, z]))
     yaw_world = yaw + sm.arctan2(T_world_then[:, 1, 0], T_world_then[:, 0, 0])
     moment1 = moment0
-    for _ in range(3):  # the bearing hardly moves within the correction: 1e-4 s after three rounds
+    for _ in range(2):  # the bearing hardly moves within the correction; `_stand` goes on to the end
         elapsed = scene.interval_s + moment1 - moment0
         xy_world, yaw1_world = drive_planar(xyz_world[:, :2], yaw_world, elapsed, drive, model.rear_axle_x_m)
         T_scanner_world = invert(T_world_scanner(scene.twist, scene.interval_s + moment1))
@@ -442,8 +451,8 @@ def _any_in_car(xyz_car: F64, model: CarModel, config: PlacementConfig) -> bool:
     return bool(inside.any())
 
 
-def _free_rays(scan: SceneScan, car: VirtualCar, k: int, config: Config) -> bool:
-    """Whether enough of the rays towards the car's box reach it."""
+def _in_sight(scan: SceneScan, car: VirtualCar, k: int, occluded: Occluded | None, config: Config) -> bool:
+    """Whether enough of the rays towards the car's box reach it, and it leaves enough to the cars behind it."""
     pose = car.pose1 if k else car.pose0
     corners = transform_points(pose, box_corners(car.model.size_m))
     distance = float(sm.hypot(pose[0, 3], pose[1, 3]))
@@ -454,7 +463,20 @@ def _free_rays(scan: SceneScan, car: VirtualCar, k: int, config: Config) -> bool
     point = rays.ray_point[toward]
     squared = (scan.prepared.scan.xyz[point] ** 2).sum(axis=1)
     passes = (point < 0) | (squared > (corners * corners).sum(axis=1).min())
-    free = int(np.count_nonzero(passes & ~rays.ray_blind[toward]))
+    passes &= ~rays.ray_blind[toward]
+    if occluded is not None and len(occluded.simulated.ray):
+        others = occluded.simulated
+        is_toward = np.zeros(len(rays), dtype=bool)
+        is_toward[toward] = True
+        crossed = is_toward[others.ray]
+        nearer = (others.xyz[:, :2] ** 2).sum(axis=1) < distance * distance
+        count = np.bincount(others.car)
+        left = np.bincount(others.car[~crossed | nearer], minlength=len(count))
+        if (left < config.min_points).any():
+            return False
+        is_toward[others.ray[crossed & nearer]] = False
+        passes &= is_toward[toward]
+    free = int(np.count_nonzero(passes))
     return free * _RETURNED >= config.min_points and free >= config.placement.min_free_share * len(toward)
 
 

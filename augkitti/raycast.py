@@ -156,27 +156,25 @@ def cast_mesh(model: CarModel, ray: I32, origin: F64, direction: F64, opaque_gla
     cosines = np.zeros((count, MAX_LAYERS))
     depth = np.zeros(count, dtype=np.int64)
     active, at = np.arange(count), start
-    for _ in range(4 * MAX_LAYERS):  # twin layers of a pane take a query each without taking a place
+    for step in range(4 * MAX_LAYERS):  # twin layers of a pane take a query each without taking a place
         if len(active) == 0:
             break
-        o, d = origin[active], direction[active]
-        face, further, cosine = structure.first_hit(o + at[active, None] * d, d)
-        hit = face >= 0
-        active, face, cosine, reached = active[hit], face[hit], cosine[hit], (at[active] + further)[hit]
+        o, d = (origin, direction) if step == 0 else (origin[active], direction[active])
+        face, further, cosine = structure.first_hit(o + at[:, None] * d, d)
+        hit = np.flatnonzero(face >= 0)
+        active, face, cosine, reached = active[hit], face[hit], cosine[hit], (at + further)[hit]
         level = depth[active]
         is_glass = model.surface[face] == GLASS
         before = ranges[active, np.maximum(level - 1, 0)]
-        twin = (level > 0) & is_glass & (reached - before < _SAME_PANE_M)
-        new = ~twin
+        new = np.flatnonzero((level == 0) | ~is_glass | (reached - before >= _SAME_PANE_M))
         rows, level = active[new], level[new]
         ranges[rows, level], faces[rows, level], cosines[rows, level] = reached[new], face[new], cosine[new]
         depth[rows] += 1
-        at[active] = reached + _STEP_M
-        goes_on = is_glass & (not opaque_glass) & (depth[active] < MAX_LAYERS)
-        active = active[goes_on]
-    met = depth > 0
-    surface = np.where(faces >= 0, model.surface[faces], MEASURED).astype(np.uint8)
-    return CarHits(ray[met], ranges[met], faces[met], surface[met], cosines[met])
+        goes_on = np.flatnonzero(is_glass & (depth[active] < MAX_LAYERS)) if not opaque_glass else active[:0]
+        active, at = active[goes_on], reached[goes_on] + _STEP_M
+    met = np.flatnonzero(depth > 0)
+    surface = np.where(faces[met] >= 0, model.surface[faces[met]], MEASURED).astype(np.uint8)
+    return CarHits(ray[met], ranges[met], faces[met], surface, cosines[met])
 
 
 def cross_box(origin: F64, direction: F64, lower: Array, upper: Array) -> tuple[F64, F64]:

@@ -118,12 +118,13 @@ _STORED = {
 def writer_options() -> dict[str, Any]:
     """Encodings and compression of a shard, as `pyarrow.parquet` takes them; small columns are stored as they are."""
     stored = {f"{name}.list.element": how for name, how in _STORED.items()}
+    squeezed = [path for path in stored if path.startswith(("flow0", "reflectance"))]
     dictionary = [path for path, encoding in stored.items() if encoding == "RLE_DICTIONARY"]
     return {
         "use_dictionary": dictionary,
         "column_encoding": {path: encoding for path, encoding in stored.items() if path not in dictionary},
-        "compression": {path: "lz4" if path.startswith("xyz") else "zstd" for path in stored},
-        "compression_level": {path: 1 for path in stored if not path.startswith("xyz")},
+        "compression": {path: "zstd" if path in squeezed else "lz4" for path in stored},
+        "compression_level": dict.fromkeys(squeezed, 1),
         "write_statistics": _FLAT,
     }
 

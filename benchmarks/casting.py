@@ -121,7 +121,7 @@ def place_cars(root: Path, cad: Path, count: int) -> Iterator[Placed]:
             pair, prepared, _ = prepared_pair(sequence, frame0, PROFILE, CONFIG, Path(cache))
             scene = make_scene(pair, prepared.scan0, prepared.scan1, CONFIG)
             for _ in range(CONFIG.placement.attempts):
-                car = propose_car(scene, [], models, must_move=True, config=CONFIG, rng=rng)
+                car = propose_car(scene, [], models, True, None, CONFIG, rng)
                 scans = (prepared.scan0, prepared.scan1)
                 if car is None:
                     continue

@@ -30,7 +30,7 @@ from augkitti.scanner import ScannerProfile, load_profile
 from augkitti.seeds import pair_seed
 from pipelines.prepare import prepared_pair
 
-PAIRS_OF_A_SEQUENCE, ROUNDS = 6, 5
+PAIRS_OF_A_SEQUENCE, ROUNDS = 32, 3
 CONFIG = Config()
 PLAIN = {"use_dictionary": False, "write_statistics": False, "compression": "zstd", "compression_level": 1}
 STAGES = (
@@ -139,11 +139,11 @@ def main() -> None:
     rays = [0]
 
     def counting(*args: Any) -> Any:
-        rays[0] += len(args[3])
-        return cast_car(*args)
+        rays[0] += len(args[1])
+        return cast_mesh(*args)
 
-    cast_car = stages.timed("cast_car", add_cars.cast_car)
-    add_cars.cast_car = counting
+    cast_mesh = stages.timed("cast_mesh", add_cars.cast_mesh)
+    add_cars.cast_mesh = counting
     per_pair: dict[str, list[float]] = defaultdict(list)
     sizes: dict[str, list[int]] = defaultdict(list)
     pairs = 0
@@ -186,7 +186,7 @@ def _print(per_pair: dict[str, list[float]], stages: Clock, sizes: dict[str, lis
     written = np.array(per_pair["ours"]) - sum(np.array(per_pair[name]) for name in parts)
     low, high = np.quantile(written, [0.1, 0.9])
     print(f"  {'write':36s} {written.mean():6.1f} ({low:.1f} to {high:.1f})")
-    for name in (*STAGES, "cast_car"):
+    for name in (*STAGES, "cast_mesh"):
         print(f"    {name:34s} {1e3 * stages.seconds[name] / pairs:6.1f}")
     ratio = np.array(per_pair["ours"]) / np.array(per_pair["floor"])
     low, high = np.quantile(ratio, [0.1, 0.9])
@@ -195,7 +195,7 @@ def _print(per_pair: dict[str, list[float]], stages: Clock, sizes: dict[str, lis
         f"  ours {whole:.2f} times the floor; by shard {np.median(ratio):.2f} in the median ({low:.2f} to {high:.2f})"
     )
     print(f"  {1e3 / np.mean(per_pair['ours']):.1f} pairs a second and core")
-    print(f"  {rays / pairs:,.0f} rays cast a pair, {rays / stages.seconds['cast_car'] / 1e6:.2f} million a second")
+    print(f"  {rays / pairs:,.0f} rays cast a pair, {rays / stages.seconds['cast_mesh'] / 1e6:.2f} million a second")
     print(f"  a pair {np.mean(sizes['ours']) / 1e6:.2f} MB, plain {np.mean(sizes['floor']) / 1e6:.2f} MB")
     print(f"  peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
 

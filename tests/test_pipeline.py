@@ -285,15 +285,16 @@ def assert_same(a, b, where=""):
 
 
 @pytest.mark.parametrize(("name", "frame"), [("2011_09_26_drive_0101_sync", 1), ("odometry_04", 0)])
-def test_a_prepared_scan_comes_back_from_the_cache_bit_for_bit(drives, tmp_path, name, frame):
+def test_a_prepared_scan_comes_back_from_the_cache_bit_for_bit(drives, tmp_path, monkeypatch, name, frame):
     sequence, profile, config = open_root(drives).sequence(name), load_profile(), Config()
     fresh, was_made = prepared_scan(sequence, frame, profile, config, tmp_path)
+    monkeypatch.setattr("pipelines.prepare._recent", {})  # as another process would find it
     again, made_again = prepared_scan(sequence, frame, profile, config, tmp_path)
     assert (was_made, made_again) == (True, False)
     assert_same(fresh, again)
 
 
-def test_a_damaged_or_foreign_cache_file_is_noticed_and_made_again(drives, tmp_path):
+def test_a_damaged_or_foreign_cache_file_is_noticed_and_made_again(drives, tmp_path, monkeypatch):
     sequence, profile, config = open_root(drives).sequence("2011_09_26_drive_0101_sync"), load_profile(), Config()
     fresh, _ = prepared_scan(sequence, 0, profile, config, tmp_path)
     (file,) = (path for path in tmp_path.rglob("*.arrays"))
@@ -302,6 +303,7 @@ def test_a_damaged_or_foreign_cache_file_is_noticed_and_made_again(drives, tmp_p
     (other,) = (path for path in tmp_path.rglob("*.arrays") if path != file)
     for bad in (b"", good[: len(good) // 2], good[:500] + b"\x00" * 40 + good[540:], other.read_bytes()):
         file.write_bytes(bad)
+        monkeypatch.setattr("pipelines.prepare._recent", {})  # as another process would find it
         again, was_made = prepared_scan(sequence, 0, profile, config, tmp_path)
         assert was_made
         assert_same(fresh, again)

@@ -141,7 +141,7 @@ def street():
 
 
 def propose(scene, seed, others=(), must_move=False, config=CONFIG):
-    return propose_car(scene, others, MODELS, must_move, config, np.random.default_rng(seed))
+    return propose_car(scene, others, MODELS, must_move, None, config, np.random.default_rng(seed))
 
 
 def proposals(scene, count, **named):
