@@ -8,7 +8,7 @@ CAD ?= ../shared/cad
 STREETS ?= build/streets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test fuzz trust check lint types bench clean
+.PHONY: help demo realism test fuzz trust check lint types bench clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -21,6 +21,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP) ## generate from the embedded street, split, validate, draw a pair
 	$(BIN)/python -m pipelines.demo
+
+realism: $(STAMP) ## the realism report on the embedded streets, into build/realism (1: not all checks passed)
+	$(BIN)/augkitti realism --resimulate --out build/realism || test $$? -eq 1
 
 test: $(STAMP) ## the tests (real scans are used where AUGKITTI_TEST_KITTI has them)
 	$(BIN)/python -m pytest -n 2 tests

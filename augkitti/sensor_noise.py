@@ -1,11 +1,13 @@
 """Sensor noise: the surfaces that rays meet on one car in, what the scanner returns of them out.
 
-Figures come from the `noise` part of the scanner profile (measured: scanner.md sections 2 and 3); here is only their
-form. `simulate_returns` is the seam for a learned model: same arguments, same result.
+Figures come from the `noise` part of the scanner profile, learned from labelled vehicles (`pipelines.fit_vehicles`);
+here is only their form. `simulate_returns` is the seam for another model: same arguments, same result.
 
-A pulse that meets a pane is reflected, absorbed or passed on; one that meets a solid surface returns if the echo is
-strong enough, which depends on the car's paint, on incidence and range. Chance along neighbouring rays is drawn from
-fields that are correlated from firing to firing and from beam to beam, since real misses come in clumps.
+An echo has a strength: the surface's own, the car's paint, incidence, range, and chance, in units of chance's standard
+deviation. Below 0 nothing returns; up to a threshold the return has reflectance 0; above it, reflectance grows with
+strength. So dark cars return less, and more of it as zeros, and zeros stand round the holes (scanner.md: correlation
+-0.76). Chance is a field over firings and beams, since real misses come in clumps. A pane reflects the pulse, swallows
+it or passes it on, to what stands in the cabin or to the far panes.
 """
 
 from dataclasses import dataclass
@@ -13,7 +15,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from scipy.ndimage import maximum_filter1d
 from scipy.signal import lfilter
 from scipy.special import expit, ndtr, ndtri
 
@@ -21,14 +24,34 @@ from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import F64
 from augkitti.raycast import CarHits
-from augkitti.scan_pair import GLASS, LAMP, MEASURED, PAINT, THROUGH_GLASS, TYRE, U8, Bool, ScanRays
+from augkitti.scan_pair import GLASS, LAMP, MEASURED, OTHER, PAINT, THROUGH_GLASS, TYRE, U8, Bool, ScanRays
 from augkitti.scanner import ScannerProfile
 
 _FIRINGS = 2150  # azimuth bins of a noise field: one a firing
+_RING_STEP_RAD = 0.0075  # between beams, between that of the upper and of the lower block (scanner.md section 1)
+_LATE = 4.0 / 3.0  # stray ranges lie from a third of the most before the surface to the most behind it
+_MOST_STEPS = 12  # of a frame's half width: beside the scanner it would cover the car
 
 
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Curve(_Part):
+    """A function by straight lines between knots; constant beyond them."""
+
+    at: tuple[float, ...] = Field(min_length=1)
+    value: tuple[float, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _one_value_a_knot(self) -> "Curve":
+        if len(self.at) != len(self.value) or any(b <= a for a, b in zip(self.at, self.at[1:], strict=False)):
+            raise ValueError("`at` must rise, and `value` have as many numbers")
+        return self
+
+    def __call__(self, x: Any) -> Any:
+        """The value at a number or at each of an array."""
+        return np.interp(x, self.at, self.value)
 
 
 class ClumpModel(_Part):
@@ -41,53 +64,76 @@ class ClumpModel(_Part):
     beam: float = Field(ge=0, lt=1)  # correlation to the next beam at the same azimuth
 
 
-class BodyModel(_Part):
-    """Logit of a return from paint: intercept + cosine * cos + paint * z + range_per_50m * range / 50 m."""
+class KindModel(_Part):
+    """Strength of the echo of a kind of surface: `strength` + `gain` x the car's paint score."""
 
-    intercept: float
-    cosine: float
-    paint: float
+    strength: float
+    gain: float
+    zero_below: float = Field(ge=0)  # weaker returns have reflectance 0
+
+
+class BodyModel(_Part):
+    """What the echo of a car's outside depends on beside its kind: paint, incidence, range, a pane's frame."""
+
+    paint: Curve  # score by the car's `paint`
+    cosine: Curve  # strength by the cosine of incidence
     range_per_50m: float
+    frame: float  # strength near panes: pillars are thinner than models have them, and pulses are wide
+    frame_m: float = Field(ge=0)  # how near
 
 
 class GlassModel(_Part):
-    """What a pane does to a pulse; `tint` spreads cars, `cosine` weakens what passes at grazing incidence."""
+    """What a pane does to a pulse that it does not reflect, and what stands in the cabin."""
 
-    reflect: float = Field(ge=0, le=1)
     pass_: float = Field(ge=0, le=1, alias="pass")
-    tint: float = Field(ge=0)
+    tint: float = Field(ge=0)  # spread of what passes over cars
+    cosine: float = Field(ge=0)  # weakens what passes at grazing incidence
     inside_return: float = Field(ge=0, le=1)
     second_pass: float = Field(ge=0, le=1)
-    cosine: float = Field(ge=0)
+    clutter: float = Field(ge=0, le=1)  # chance of meeting what models lack: seats, wheel, people
+    clutter_m: Curve  # its depth behind the pane by a number from 0 to 1
 
 
 class ReflectanceModel(_Part):
-    """Shares of exact zeros, and quantiles of the rest, as a field that is smooth along the ring."""
+    """Reflectance by strength above the threshold of zeros; that of what is seen through panes by chance."""
 
-    body_zero: float = Field(ge=0, le=1)
-    glass_zero: float = Field(ge=0, le=1)
+    strength: Curve
     inside_zero: float = Field(ge=0, le=1)
+    inside: Curve  # by a number from 0 to 1
+
+
+class ReliefModel(_Part):
+    """What bodies have and models lack: roughness, relief that is smooth along the ring, and stray ranges."""
+
+    rough_m: float = Field(ge=0)  # standard deviation seen straight on; over the cosine of incidence
+    std_m: float = Field(ge=0)
     firing: float = Field(ge=0, lt=1)
     beam: float = Field(ge=0, lt=1)
-    quantiles: tuple[float, ...]
-    values: tuple[float, ...]
+    stray: float = Field(
+        ge=0, le=1
+    )  # share of returns that lie up to `most_m` behind the surface, or a third of it before
+    most_m: float = Field(ge=0, le=0.13)  # of both: contract, invariant 4 allows 0.25 m, beam biases take 0.06 m of it
 
 
 class NoiseModel(_Part):
-    """The `noise` part of a scanner profile."""
+    """What the `noise` part of a scanner profile says of vehicles; other parts of it are read elsewhere."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
     source: str
     shot_std_m: float = Field(ge=0)
-    grazing_std_m: float = Field(ge=0)  # roughness over cos of incidence
     isolated_drop: float = Field(ge=0, le=1)
     body: BodyModel
     body_clump: ClumpModel
+    paint: KindModel
+    pane: KindModel
+    tyre: KindModel
+    lamp: KindModel
+    other: KindModel
     glass: GlassModel
     glass_clump: ClumpModel
-    tyre_return: float = Field(ge=0, le=1)
-    lamp_return: float = Field(ge=0, le=1)
-    other_return: float = Field(ge=0, le=1)
     reflectance: ReflectanceModel
+    relief: ReliefModel
 
 
 @lru_cache(maxsize=8)
@@ -134,53 +180,39 @@ def simulate_returns(
 ) -> CarReturns:
     """Send one pulse along every ray that meets a car and say what comes back; `opaque_glass`: panes act as paint."""
     model = noise_model(profile)
-    count, layers = hits.range_m.shape
+    count = len(hits.ray)
     ring, azimuth = rays.ray_ring[hits.ray], rays.ray_azimuth_rad[hits.ray]
-    fields = _FieldGrid(ring, azimuth)
-    body_luck = ndtr(fields.draw(model.body_clump, rng))
-    pane_luck = ndtr(fields.draw(model.glass_clump, rng))
-    inside_luck = ndtr(fields.draw(model.glass_clump, rng))
-    shine = ndtr(fields.draw_smooth(model.reflectance.firing, model.reflectance.beam, rng))
-    shot = rng.standard_normal(count)
-    lost = rng.random(count) < model.isolated_drop
+    grid = FieldGrid(ring, azimuth)
+    chance = grid.draw(model.body_clump, rng)
+    pane_chance = grid.draw(model.glass_clump, rng)
+    relief = grid.draw_smooth(model.relief.firing, model.relief.beam, rng)
+    white = rng.standard_normal((2, count))
+    luck = rng.random((3, count))
 
-    clear = expit(model.glass.tint * ndtri(np.clip(1.0 - look.tint, 1e-6, 1 - 1e-6)))  # 0.5 for the middle car
-    stop = np.full(count, np.inf)
-    layer_of_stop = np.full(count, -1, dtype=np.int64)
-    returned = np.zeros(count, dtype=bool)
-    alive = np.ones(count, dtype=bool)
-    panes = np.zeros(count, dtype=np.int64)
-    for level in range(layers):
-        surface, cosine, distance = hits.surface[:, level], hits.cos_incidence[:, level], hits.range_m[:, level]
-        here = alive & (surface != MEASURED)
-        if not here.any():
-            break
-        pane = here & (surface == GLASS) & (not opaque_glass)
-        luck = np.where(panes == 0, pane_luck, inside_luck)
-        passes = np.where(panes == 0, model.glass.pass_, model.glass.second_pass) * 2.0 * clear
-        passes = np.clip(passes * sm.power(cosine, model.glass.cosine), 0.0, 1.0 - model.glass.reflect)
-        reflects = np.where(panes == 0, model.glass.reflect, 0.5 * model.glass.reflect)
-        shines_back = pane & (luck < reflects)
-        goes_on = pane & (luck > 1.0 - passes)
-        solid = here & ~pane
-        chance = np.where(panes == 0, _solid_return(surface, cosine, distance, look, model), model.glass.inside_return)
-        echo = solid & (np.where(panes == 0, body_luck, inside_luck) < chance)
-        ends = here & ~goes_on
-        stop[ends], layer_of_stop[ends] = distance[ends], level
-        returned |= shines_back | echo
-        panes[goes_on] += 1
-        alive &= ~ends
-    returned &= ~lost
-    rows = np.arange(count)
-    last = np.maximum(layer_of_stop, 0)
-    surface = hits.surface[rows, last]
-    surface[(panes > 0) & (layer_of_stop > 0)] = THROUGH_GLASS
-    cosine = np.maximum(hits.cos_incidence[rows, last], 0.1)
+    outside = hits.surface[:, 0] if count else np.zeros(0, dtype=np.uint8)
+    cosine = hits.cos_incidence[:, 0] if count else np.zeros(0)
+    stop = hits.range_m[:, 0].copy() if count else np.zeros(0)
+    pane = (outside == GLASS) & (not opaque_glass)
+    strength, zero_below = _strength(hits, pane, look, model, grid)
+    strength += np.where(pane, pane_chance, chance)
+    returned = strength > 0.0
+    reflectance = _by_strength(strength - zero_below, model, profile)
+    surface = outside.copy()
+
+    through = np.flatnonzero(pane & ~returned & _passes(pane_chance, strength, cosine, look, model))
+    if len(through):
+        depth = ndtr(chance[through])  # two fields that panes have no other use for
+        echo = ndtr(np.sqrt(0.5) * (relief[through] + white[1, through]))
+        stop[through], returned[through] = _cabin(hits, through, depth, echo, luck[1, through], model)
+        surface[through] = THROUGH_GLASS
+        reflectance[through] = _through_glass(1.0 - depth, model, profile)
+
+    returned &= luck[2] >= model.isolated_drop
     true_m = np.where(np.isfinite(stop), stop, 0.0)
-    noise = shot * sm.hypot(model.shot_std_m, np.where(surface == THROUGH_GLASS, 0.0, model.grazing_std_m / cosine))
-    measured = quantise_range(true_m + profile.range_bias_m[ring] + noise, ring, profile)
+    error = _range_error(cosine, surface, relief, white, luck[0], model)
+    measured = quantise_range(true_m + profile.range_bias_m[ring] + error, ring, profile)
     returned &= (measured >= profile.min_range_m) & (measured <= profile.max_range_m)
-    return CarReturns(stop, returned, measured, _reflectance(surface, shine, look, model, profile), surface)
+    return CarReturns(stop, returned, measured, reflectance, surface)
 
 
 def quantise_range(range_m: F64, ring: U8, profile: ScannerProfile) -> F64:
@@ -189,32 +221,87 @@ def quantise_range(range_m: F64, ring: U8, profile: ScannerProfile) -> F64:
     return np.asarray(phase + quantum * np.rint((range_m - phase) / quantum))
 
 
-def _solid_return(surface: U8, cosine: F64, distance: F64, look: CarLook, model: NoiseModel) -> F64:
-    body = model.body
-    score = ndtri(np.clip(look.paint, 1e-6, 1 - 1e-6))
-    reach = np.where(np.isfinite(distance), distance, 0.0) / 50.0
-    paint = expit(body.intercept + body.cosine * cosine + body.paint * score + body.range_per_50m * reach)
-    chance = np.where((surface == PAINT) | (surface == GLASS), paint, model.other_return)
-    chance = np.where(surface == TYRE, model.tyre_return, chance)
-    return np.asarray(np.where(surface == LAMP, model.lamp_return, chance))
+def _strength(hits: CarHits, pane: Bool, look: CarLook, model: NoiseModel, grid: "FieldGrid") -> tuple[F64, F64]:
+    """Strength (K,) of the echo of the first surface without chance, and the threshold (K,) of its zeros."""
+    if not len(pane):
+        return np.zeros(0), np.zeros(0)
+    body, outside = model.body, np.where(pane, GLASS, hits.surface[:, 0])
+    outside[(outside == GLASS) & ~pane] = PAINT
+    score = float(body.paint(look.paint))
+    base, zero_below = np.zeros(OTHER + 1), np.zeros(OTHER + 1)
+    kinds = ((PAINT, model.paint), (GLASS, model.pane), (TYRE, model.tyre), (LAMP, model.lamp), (OTHER, model.other))
+    for kind, part in kinds:
+        base[kind], zero_below[kind] = part.strength + part.gain * score, part.zero_below
+    strength = base[outside] + body.range_per_50m / 50.0 * hits.range_m[:, 0]
+    turned = (outside == PAINT) | (outside == LAMP)
+    strength[turned] += body.cosine(hits.cos_incidence[turned, 0])
+    if pane.any():
+        strength[(outside == PAINT) & grid.near(pane, body.frame_m / float(np.median(hits.range_m[:, 0])))] += (
+            body.frame
+        )
+    return strength, zero_below[outside]
 
 
-def _reflectance(surface: U8, shine: F64, look: CarLook, model: NoiseModel, profile: ScannerProfile) -> F64:
+def _passes(pane_chance: F64, strength: F64, cosine: F64, look: CarLook, model: NoiseModel) -> Bool:
+    """Which pulses (K,) a pane would let through: those with the least luck, so that they never were reflected ones."""
+    glass = model.glass
+    clear = 2.0 * float(expit(glass.tint * ndtri(np.clip(1.0 - look.tint, 1e-6, 1 - 1e-6))))  # 1 for the middle car
+    chance = np.clip(glass.pass_ * clear * sm.power(cosine, glass.cosine), 1e-6, 1.0 - 1e-6)
+    return np.asarray((pane_chance < ndtri(chance)) & (strength <= 0.0))
+
+
+def _cabin(hits: CarHits, through: Any, depth: F64, echo: F64, luck: F64, model: NoiseModel) -> tuple[F64, Bool]:
+    """Where pulses (M,) that passed the first pane end (metres; inf: they leave the car), and which return."""
+    glass = model.glass
+    ranges, kinds = hits.range_m[through], hits.surface[through]
+    met = np.where(depth < glass.clutter, ranges[:, 0] + glass.clutter_m(depth / max(glass.clutter, 1e-9)), np.inf)
+    stop = np.full(len(through), np.inf)
+    seen = echo < glass.inside_return
+    alive, leaves = np.ones(len(through), dtype=bool), luck < glass.second_pass
+    for level in range(1, ranges.shape[1]):
+        here = alive & (kinds[:, level] != MEASURED)
+        clutter = here & (met < ranges[:, level])  # before something of the car: else it would stand outside
+        stop[clutter] = met[clutter]
+        here &= ~clutter
+        goes_on = here & (kinds[:, level] == GLASS) & leaves
+        ends = here & ~goes_on
+        stop[ends] = ranges[ends, level]
+        alive = here & goes_on
+        if not alive.any():
+            break
+    return stop, seen & np.isfinite(stop)
+
+
+def _by_strength(above: F64, model: NoiseModel, profile: ScannerProfile) -> F64:
+    """Reflectance (K,) by strength above the threshold of zeros."""
+    value = _in_steps(model.reflectance.strength(above), profile)
+    return np.where(above > 0.0, value, 0.0)
+
+
+def _through_glass(depth: F64, model: NoiseModel, profile: ScannerProfile) -> F64:
+    """Reflectance (M,) of what is seen through a pane."""
     part = model.reflectance
-    # Dark cars show more zeros (scanner.md: correlation -0.76 with the body's return rate).
-    zero = np.full(len(surface), np.clip(part.body_zero + 0.7 * (0.5 - look.paint), 0.02, 0.98))
-    zero = np.where(surface == GLASS, part.glass_zero, zero)
-    zero = np.where(surface == THROUGH_GLASS, part.inside_zero, zero)
-    zero = np.where(surface == TYRE, 0.8, zero)
-    zero = np.where(surface == LAMP, 0.05, zero)
-    above = np.clip((shine - zero) / (1.0 - zero), 0.0, 1.0)
-    value = np.interp(above, part.quantiles, part.values)
-    value = np.where(surface == LAMP, 0.5 + 0.49 * above, value)
+    value = _in_steps(part.inside((depth - part.inside_zero) / max(1.0 - part.inside_zero, 1e-9)), profile)
+    return np.where(depth < part.inside_zero, 0.0, value)
+
+
+def _in_steps(value: F64, profile: ScannerProfile) -> F64:
     steps = np.clip(np.rint(value / profile.reflectance_quantum), 1, 99)
-    return np.where(shine < zero, 0.0, steps * profile.reflectance_quantum)
+    return np.asarray(steps * profile.reflectance_quantum)
 
 
-class _FieldGrid:
+def _range_error(cosine: F64, surface: U8, relief: F64, white: F64, luck: F64, model: NoiseModel) -> F64:
+    """Error (K,) metres beside the beam's bias: shot noise, roughness, relief, stray ranges."""
+    inside, part = surface == THROUGH_GLASS, model.relief
+    rough = np.where(inside, 0.0, part.rough_m / np.maximum(cosine, 0.1))
+    # Late rather than early: towards the scanner an error leaves the car's box, which may be sheared by the sweep too.
+    stray = part.most_m * (_LATE * ndtr(white[1]) - (_LATE - 1.0))
+    shape = part.std_m * relief + np.where(luck < part.stray, stray, 0.0)
+    shape = np.where(inside, 0.0, np.clip(shape, -(_LATE - 1.0) * part.most_m, part.most_m))
+    return np.asarray(white[0] * sm.hypot(model.shot_std_m, rough) + shape)
+
+
+class FieldGrid:
     """Draws correlated chance on the patch of (beam, firing) cells that a car covers."""
 
     def __init__(self, ring: U8, azimuth_rad: F64) -> None:
@@ -235,12 +322,21 @@ class _FieldGrid:
         white = max(0.0, 1.0 - clump.long - clump.short)
         field = np.sqrt(clump.long) * self._smooth(clump.long_firing, clump.beam, rng)
         field += np.sqrt(clump.short) * self._smooth(clump.short_firing, clump.beam, rng)
-        field += np.sqrt(white) * rng.standard_normal(self.shape)
-        return np.asarray(field[self.row, self.column] / np.sqrt(clump.long + clump.short + white))
+        out = field[self.row, self.column] + np.sqrt(white) * rng.standard_normal(len(self.row))
+        return np.asarray(out / np.sqrt(clump.long + clump.short + white))
 
     def draw_smooth(self, firing: float, beam: float, rng: np.random.Generator) -> F64:
         """One standard normal value for each ray, from a field with one correlation length."""
         return np.zeros(0) if self.empty else np.asarray(self._smooth(firing, beam, rng)[self.row, self.column])
+
+    def near(self, chosen: Bool, angle_rad: float) -> Bool:
+        """Which rays lie within an angle of a chosen one along beams and firings, one step at least."""
+        field = np.zeros(self.shape, dtype=np.uint8)
+        field[self.row[chosen], self.column[chosen]] = 1
+        for axis, step in ((0, _RING_STEP_RAD), (1, 2.0 * np.pi / _FIRINGS)):
+            reach = min(max(int(angle_rad / step + 0.5), 1), _MOST_STEPS)
+            field = maximum_filter1d(field, 2 * reach + 1, axis=axis)
+        return np.asarray(field[self.row, self.column] > 0)
 
     def _smooth(self, firing: float, beam: float, rng: np.random.Generator) -> Any:
         field = rng.standard_normal(self.shape)

@@ -39,6 +39,7 @@ SAME_M = 1e-3
 AROUND_M = 0.3  # beams do not start at the frame's origin
 OURS, OURS_FIRST = "ours", "ours, first hits at the car's moment alone"
 TRIMESH, FALLBACK = "trimesh, all rays", "trimesh without Embree, all rays"
+TRIMESH_LAYERS = "trimesh, all rays, all layers, as ours"
 OPEN3D, OPEN3D_NEAR = "Open3D, all rays", "Open3D, rays cropped first"
 OPEN3D_KEPT = "Open3D, structure kept, our near rays in the car's frame"
 
@@ -76,6 +77,7 @@ def main() -> None:
         OURS: cast_ours,
         OURS_FIRST: cast_ours_first,
         TRIMESH: cast_trimesh,
+        TRIMESH_LAYERS: cast_trimesh_layers,
         OPEN3D: lambda placed: cast_open3d(o3d, placed),
         OPEN3D_NEAR: lambda placed: cast_open3d_near(o3d, placed),
         OPEN3D_KEPT: _KeptScenes(o3d),
@@ -162,6 +164,12 @@ def cast_trimesh(placed: Placed, interface: Any = None) -> tuple[Any, ...]:
     mesh = _mesh(placed).apply_transform(placed.pose)
     rays = mesh.ray if interface is None else interface(mesh)
     return rays.intersects_location(placed.origin, placed.direction, multiple_hits=False)
+
+
+def cast_trimesh_layers(placed: Placed) -> tuple[Any, ...]:
+    """Every layer that a ray meets, as ours has them behind panes."""
+    mesh = _mesh(placed).apply_transform(placed.pose)
+    return mesh.ray.intersects_location(placed.origin, placed.direction, multiple_hits=True)
 
 
 def cast_fallback(placed: Placed) -> tuple[Any, ...]:

@@ -79,7 +79,7 @@ def print_columns(tables: list[pa.Table]) -> None:
             encoding = "DICTIONARY"
         else:
             encoding = chosen["column_encoding"][path]
-        ours = (encoding, chosen["compression"][path], chosen["compression_level"][path])
+        ours = (encoding, chosen["compression"][path], chosen["compression_level"].get(path))
         ways = candidates(column)
         ways.setdefault(ours, _way(column, *ours))
         alone = [table.select([column]) for table in tables]

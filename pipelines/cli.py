@@ -299,6 +299,41 @@ def synthesize(
         synthesize_drives(out, drives, frames, seed, jobs, profile)
 
 
+@app.command()
+def realism(
+    dataset: Annotated[
+        Path | None,
+        typer.Argument(parser=_place, metavar="[DATASET]", help="Data set whose own cars are judged too."),
+    ] = None,
+    kitti: Kitti = None,
+    cad: Cad = None,
+    out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("realism-report"),
+    resimulate: Annotated[
+        bool, typer.Option("--resimulate", help="Compare real and simulated cars ray by ray, too.")
+    ] = False,
+    seed: Seed = 0,
+    max_tracks: Annotated[int | None, typer.Option(min=1, help="Stop after so many labelled cars.")] = None,
+    views: Annotated[int, typer.Option(min=1, help="Most views of one car.")] = 12,
+    profile: Profile = None,
+) -> None:
+    """Prove how real simulated cars are: one HTML report beside real labelled cars, with a verdict at the top."""
+    with _answers():
+        from pipelines.realism import realism as run
+
+        code = run(
+            dataset,
+            kitti,
+            cad,
+            out,
+            resimulate,
+            profile=profile,
+            seed=seed,
+            max_tracks=max_tracks,
+            views_of_a_track=views,
+        )
+        raise typer.Exit(code)
+
+
 @config_app.command("show")
 def config_show(config: ConfigFile = None) -> None:
     """Print each key with its value and one line of why; valid YAML."""
