@@ -1,6 +1,6 @@
 """Plan, index and split a million pairs, scans faked by an index of names: seconds and memory of each step.
 
-    python benchmarks/million.py [--n 1000000] [--drives 151] [--frames 290] [--seconds-per-pair 0.35]
+    python benchmarks/million.py [--n 1000000] [--drives 151] [--frames 290] [--seconds-per-pair 0.075]
 
 Two sources: one as large as KITTI's raw data (151 drives), whose pairs are used again and again at new variants, and
 one of as many pairs as are asked for, in 5,000 drives. No scan is read and no shard is written; the rest is the
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=1_000_000)
     parser.add_argument("--drives", type=int, default=151)
     parser.add_argument("--frames", type=int, default=290)
-    parser.add_argument("--seconds-per-pair", type=float, default=0.35)
+    parser.add_argument("--seconds-per-pair", type=float, default=0.075)
     asked = parser.parse_args()
     wide = 5_000
     for drives, frames in ((asked.drives, asked.frames), (wide, asked.n // wide + 1)):

@@ -35,12 +35,12 @@ from pipelines.stage import check_scheduler, console
 from pipelines.streets import Streets, make_streets
 
 # Measured on real scans with real CAD models, seconds of one core; docs/figures.md, "Generation". For --dry-run only.
-BYTES_PER_PAIR = 3.3e6
+BYTES_PER_PAIR = 3.0e6
 BYTES_PER_PREPARED_SCAN = 0.48e6
 BYTES_PER_STREET_SCAN = 2.0e6
 _SKIPPED_SHOWN = 8  # rows of the closing table; the index has them all
-SECONDS_PER_PAIR = 0.7
-SECONDS_PER_PREPARED_SCAN = 0.35
+SECONDS_PER_PAIR = 0.075
+SECONDS_PER_PREPARED_SCAN = 0.25
 SECONDS_PER_STREET_SCAN = 0.4
 
 
