@@ -23,6 +23,7 @@ from augkitti.frames import F64, wrap_angle
 from augkitti.scan_pair import I32, NO_TICK, U8, U16, Bool, Scan, ScanRays
 
 DEFAULT_PROFILE = "hdl64e_kitti"
+PROFILE_FILE = "profile.json"  # in the folder of a fitted profile
 _ON_RAY_M = 0.002  # scanner.md: p99.9 of the distance of a point to its ray is 0.78 mm; 2 mm settles the wrap trap
 _MIN_POINTS_OF_A_TICK = 4  # a fired tick has about 50 returns; fewer are stray points
 _DEFAULT_FIRINGS = 2150  # scanner.md: 2146 to 2164 fired ticks a scan
@@ -89,7 +90,7 @@ class ScannerProfile:
 
 
 def load_profile(path: Path | None = None) -> ScannerProfile:
-    """The shipped profile of KITTI's HDL-64E, or the one in a JSON file of the same form.
+    """The shipped profile of KITTI's HDL-64E, or the one in a JSON file of the same form or in a profile's folder.
 
     Raises:
         InputError: the file is missing, not JSON, or a key is missing or of the wrong size.
@@ -98,9 +99,11 @@ def load_profile(path: Path | None = None) -> ScannerProfile:
         text = (resources.files("augkitti") / "profiles" / f"{DEFAULT_PROFILE}.json").read_text(encoding="utf-8")
         return profile_from_content(json.loads(text), DEFAULT_PROFILE)
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        file = Path(path) / PROFILE_FILE if Path(path).is_dir() else Path(path)
+        content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as err:
-        raise InputError(path, f"not readable as a scanner profile ({err})", "give a profile JSON file") from err
+        remedy = "give a profile JSON file, or a folder with profile.json in it"
+        raise InputError(path, f"not readable as a scanner profile ({err})", remedy) from err
     return profile_from_content(content, str(path))
 
 

@@ -334,6 +334,19 @@ def realism(
         raise typer.Exit(code)
 
 
+@app.command("fit-sensor")
+def fit_sensor(
+    kitti: Kitti = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Profile's folder, written.")] = Path("profile"),
+    json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
+) -> None:
+    """Learn a scanner's beam table, encoder, spin, steps and shadow from raw scans alone."""
+    with _answers():
+        from pipelines.fit_sensor import fit_sensor as run
+
+        run(_needed(kitti), out, json)
+
+
 @config_app.command("show")
 def config_show(config: ConfigFile = None) -> None:
     """Print each key with its value and one line of why; valid YAML."""
@@ -381,6 +394,12 @@ def cache_clear() -> None:
 
         count, size = clear(cache_folder())
         print(f"{count:,} entries removed, {size / 1e9:,.2f} GB")
+
+
+def _needed(kitti: Path | None) -> Path:
+    if kitti is None:
+        raise InputError("--kitti", "not given", "name the folder with KITTI in it, or set AUGKITTI_KITTI")
+    return kitti
 
 
 def _cars(text: str | None) -> tuple[int, int] | None:
