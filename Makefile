@@ -54,6 +54,7 @@ bench: $(STAMP) ## speed and accuracy figures of docs/figures.md, on KITTI=, CAD
 	$(BIN)/python benchmarks/window_shares.py $(KITTI) $(CAD)
 	$(BIN)/python benchmarks/generate.py $(KITTI) $(CAD)
 	$(BIN)/python benchmarks/street_vs_real.py $(KITTI) $(STREETS)
+	$(BIN)/python benchmarks/network.py $(KITTI)
 
 clean: ## remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build *.egg-info
