@@ -56,6 +56,7 @@ def split_dataset(
     seed: int = 0,
     like: Path | str | None = None,
     allow_frames_split: bool = False,
+    test_on: Sequence[str] = (),
 ) -> Splits:
     """Split a finished data set: writes `splits.json` and renews the card.
 
@@ -65,14 +66,19 @@ def split_dataset(
         seed: decides between assignments that are equally near the ratios.
         like: another data set's `splits.json`, whose recordings to follow (so that K and AK get one split).
         allow_frames_split: where there are too few recordings, divide the longest by frames, with a gap; for toy sets.
+        test_on: recordings to test on, whatever their share; the others are divided into train and validation.
 
     Raises:
-        InputError: the folder is unfinished; ratios that are none; too few recordings; recordings that `like` lacks.
+        InputError: the folder is unfinished; ratios that are none; too few recordings; recordings that `like` lacks;
+            recordings to test on that are not there.
     """
     folder = as_path(folder)
     index = read_index(folder)
     if like is not None:
         splits = split_like(index.shards, as_path(like))
+    elif test_on:
+        wanted = check_ratios(ratios)
+        splits = Splits(split_held_out(index.shards, wanted, seed, test_on, folder), wanted, seed)
     else:
         wanted = check_ratios(ratios)
         recordings = {shard.recording for shard in index.shards if shard.rows}
@@ -111,6 +117,24 @@ def split_recordings(
     chosen = _assign(pairs[usable], share * pairs.sum(), generator(seed, "split"))
     split_of = {names[i]: SPLIT_NAMES[used[k]] for i, k in zip(usable, chosen, strict=True)}
     return _by_split(shards, lambda shard: split_of.get(shard.recording))
+
+
+def split_held_out(
+    shards: Sequence[ShardEntry], ratios: Sequence[float], seed: int, test_on: Sequence[str], folder: Path
+) -> dict[str, tuple[str, ...]]:
+    """Named recordings are `test`; the others become train and validation, as near their ratios as they allow.
+
+    Raises:
+        InputError: a recording that is not there; too few others.
+    """
+    there = {shard.recording for shard in shards if shard.rows}
+    unknown = sorted(set(test_on) - there)
+    if unknown:
+        raise InputError(folder, f"holds no pair of {', '.join(unknown)}", f"name some of {', '.join(sorted(there))}")
+    others = [shard for shard in shards if shard.recording not in test_on]
+    rest = split_recordings(others, (*check_ratios(ratios)[:2], 0.0), seed)
+    split_of = {path: name for name, paths in rest.items() for path in paths}
+    return _by_split(shards, lambda shard: "test" if shard.recording in test_on else split_of.get(shard.path))
 
 
 def split_like(shards: Sequence[ShardEntry], like: Path) -> Splits:

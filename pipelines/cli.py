@@ -230,6 +230,12 @@ def split(
     ratios: Annotated[tuple[float, float, float], typer.Option(help="Train, validation, test.")] = (70.0, 10.0, 20.0),
     seed: Seed = 0,
     like: Annotated[Path | None, typer.Option(help="A splits.json whose recordings to follow.")] = None,
+    test_on: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="RECORDING", help="To test on, whatever the ratios: 2011_09_26_drive_0013; repeat, or commas."
+        ),
+    ] = None,
     allow_frames_split: Annotated[
         bool, typer.Option("--allow-frames-split", help="May divide one recording, with a gap: toy sets only.")
     ] = False,
@@ -238,7 +244,10 @@ def split(
     with _answers():
         from pipelines.inspect_set import split_set
 
-        split_set(out, ratios, seed, like, allow_frames_split)
+        named = [name for text in test_on or [] for name in text.split(",") if name]
+        if named and like is not None:
+            raise InputError("--test-on", "and --like say both what to test on", "give one of them")
+        split_set(out, ratios, seed, like, allow_frames_split, named)
 
 
 @app.command()

@@ -3,7 +3,7 @@
 import json
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -118,18 +118,23 @@ def show_data_status(kitti: Path | None) -> int:
 
 
 def split_set(
-    out: Path, ratios: tuple[float, float, float], seed: int, like: Path | None, allow_frames_split: bool
+    out: Path,
+    ratios: tuple[float, float, float],
+    seed: int,
+    like: Path | None,
+    allow_frames_split: bool,
+    test_on: Sequence[str] = (),
 ) -> None:
     """Divide a data set by recording and print what went where.
 
     Raises:
-        InputError: unfinished set, no ratios, too few recordings, or recordings that `like` lacks.
+        InputError: unfinished set, no ratios, too few recordings, or recordings that `like` or the set lacks.
     """
     from augkitti.dataset_index import read_index
     from augkitti.splits import pairs_by_split, split_dataset
 
     try:
-        splits = split_dataset(out, ratios, seed, like, allow_frames_split)
+        splits = split_dataset(out, ratios, seed, like, allow_frames_split, test_on)
     except OSError as err:
         raise InputError(out, f"cannot be written ({err.strerror})", "check its permissions") from err
     index = read_index(out)

@@ -171,6 +171,23 @@ def test_like_names_recordings_that_it_does_not_know(tmp_path):
         split_dataset(tmp_path / "k", like=tmp_path / "ak" / "splits.json")
 
 
+def test_recordings_named_to_test_on_are_the_test_split_and_the_others_are_divided(tmp_path):
+    write_folder(tmp_path, [3, 9, 4, 2])
+    splits = split_dataset(tmp_path, test_on=["2011_09_26_drive_0001"]).splits
+    recording_of = {shard.path: shard.recording for shard in read_index(tmp_path).shards}
+    sets = {name: {recording_of[path] for path in paths} for name, paths in splits.items()}
+    assert sets["test"] == {"2011_09_26_drive_0001"}
+    assert sets["train"] | sets["validation"] == {f"2011_09_26_drive_{i:04d}" for i in (0, 2, 3)}
+    assert sets["train"]
+    assert sets["validation"] == {"2011_09_26_drive_0003"}
+
+
+def test_recording_to_test_on_that_is_not_there_is_named(tmp_path):
+    write_folder(tmp_path, [3, 9, 4])
+    with pytest.raises(InputError, match="no pair of drive_77; name some of 2011_09_26_drive_0000"):
+        split_dataset(tmp_path, test_on=["drive_77"])
+
+
 def test_one_recording_is_divided_by_frames_with_a_gap_where_that_is_allowed(tmp_path):
     frames = [range(first, first + 8) for first in (0, 30, 60, 62, 90, 120)]
     write_folder(tmp_path, [48], [frames])
