@@ -17,7 +17,7 @@ from augkitti.frames import (
     rotate_vectors,
     transform_points,
 )
-from augkitti.labelled_objects import LabelledObjects, pair_interval
+from augkitti.labelled_objects import pair_interval
 from augkitti.occlusion import Occluded, keep_nearest, measured_range
 from augkitti.pair_motion import T_world_car, T_world_scanner, ego_twist
 from augkitti.placement import car_box
@@ -169,7 +169,6 @@ def occlude(casts: Sequence[Cast], k: int, prepared: PreparedScan, profile: Scan
 def finish_pair(
     pair: ScanPair,
     prepared: PreparedPair,
-    labelled: LabelledObjects,
     cars: Sequence[VirtualCar],
     casts: Sequence[Cast],
     occluded: tuple[Occluded, Occluded],
@@ -177,7 +176,7 @@ def finish_pair(
     pair_id: str,
 ) -> AugmentedPair:
     """Hide what the cars hide, label every point, and fill the contract's columns."""
-    scan0, scan1 = prepared.scan0, prepared.scan1
+    scan0, scan1, labelled = prepared.scan0, prepared.scan1, prepared.labelled
     occluded0, occluded1 = occluded
     first_car = len(labelled.objects)
     columns0 = _columns(scan0, occluded0, labelled.instance0, first_car)

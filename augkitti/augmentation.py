@@ -34,8 +34,9 @@ def prepare_scan(scan: Scan, profile: ScannerProfile, config: Config) -> Prepare
 
 
 def prepare_pair(pair: ScanPair, scan0: PreparedScan, scan1: PreparedScan, config: Config) -> PreparedPair:
-    """All that depends on the source of a pair alone: both prepared scans, and what moves there without a label."""
-    return PreparedPair(scan0, scan1, unlabelled_movers(pair, scan0, scan1, config.movers))
+    """All that depends on a pair's source alone: both prepared scans, whose their points are, what moves unlabelled."""
+    labelled = label_points(pair, scan0, scan1)
+    return PreparedPair(scan0, scan1, labelled, unlabelled_movers(pair, scan0, scan1, config.movers))
 
 
 def augment_pair(
@@ -62,7 +63,6 @@ def augment_pair(
         pair, prepare_scan(pair.scan0, profile, config), prepare_scan(pair.scan1, profile, config), config
     )
     scan0, scan1 = prepared.scan0, prepared.scan1
-    labelled = label_points(pair, scan0, scan1)
     scene = make_scene(pair, scan0, scan1, config)
     fewest, most = config.cars
     rng = generator(seed, "place")
@@ -89,4 +89,4 @@ def augment_pair(
             occluded = together
     if len(cars) < fewest:
         return None
-    return finish_pair(pair, prepared, labelled, cars, casts, occluded, seed, pair_id)
+    return finish_pair(pair, prepared, cars, casts, occluded, seed, pair_id)

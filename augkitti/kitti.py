@@ -266,6 +266,17 @@ def read_labels(sequence: Sequence, frame: int) -> tuple[LabelledBox, ...]:
     return ()
 
 
+def labels_digest(sequence: Sequence, frame0: int) -> str:
+    """sha256 over the labels of frame0 and the next frame. A cache key.
+
+    Raises:
+        InputError: as `read_labels`.
+    """
+    labels = [[label.id, label.category, label.box.tobytes().hex()] for label in read_labels(sequence, frame0)]
+    others = [[label.id, label.category, label.box.tobytes().hex()] for label in read_labels(sequence, frame0 + 1)]
+    return hashlib.sha256(json.dumps([labels, others]).encode()).hexdigest()
+
+
 def label_reach(sequence: Sequence) -> tuple[Coverage, tuple[float, float] | None]:
     """The contract's `label_coverage` and `label_azimuth` (from, to, radians, velo; for `camera` only).
 

@@ -1,6 +1,6 @@
 """Labelled objects: a pair's own labels in, contract rows with rigid motion and the points of each object out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ from augkitti.frames import (
 )
 from augkitti.ground import height_at
 from augkitti.pair_motion import T_world_scanner, ego_twist
-from augkitti.scan_pair import I16, Bool, LabelledBox, ObjectRecord, PreparedScan, ScanPair
+from augkitti.scan_pair import I16, LabelledBox, LabelledObjects, ObjectRecord, PreparedScan, ScanPair
 from augkitti.scanner import azimuth_time
 
 ABOVE_GROUND_M = 0.15  # contract: lower points in a box are ground
@@ -27,24 +27,9 @@ SEAM_RAD = np.deg2rad(15.0)  # contract: straight behind, the sweep sees things 
 _STANDING_M = 0.1  # displacement over ground below which a box stands: boxes of parked cars wander by 6 cm a scan
 
 
-@dataclass(frozen=True, eq=False)
-class LabelledObjects:
-    """The source's own objects of a pair, and the measured points that are theirs."""
-
-    objects: tuple[ObjectRecord, ...]  # point counts not yet filled in
-    instance0: I16  # (N0,) row in `objects` of each valid point of scan 0; -1 for none
-    instance1: I16  # (N1,)
-    unknown0: Bool  # (N0,) points whose flow the labels leave open
-
-
 def label_points(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedScan) -> LabelledObjects:
     """Match the boxes of both scans by id, give each its motion, and find its points."""
-    by_id1 = {label.id: label for label in pair.labels1}
-    ids0 = {label.id for label in pair.labels0}
-    rows: list[tuple[LabelledBox | None, LabelledBox | None]] = [(a, by_id1.get(a.id)) for a in pair.labels0]
-    rows += [(None, label) for label in pair.labels1 if label.id not in ids0]
-    twist = ego_twist(pair.ego_motion, pair_interval(pair))
-    objects = tuple(_object(pair, twist, first, second) for first, second in rows)
+    objects = label_objects(pair)
     boxes0 = [o.box0 for o in objects]
     instance0 = _points_of(prepared0, boxes0)
     instance1 = _points_of(prepared1, [o.box1 for o in objects])
@@ -61,6 +46,16 @@ def label_points(pair: ScanPair, prepared0: PreparedScan, prepared1: PreparedSca
             shell = points_in_box(xyz, T_velo_box, size, SHELL_M) & ~points_in_box(xyz, T_velo_box, size)
             unknown0[near[shell & (instance0[near] < 0)]] = True
     return LabelledObjects(objects, instance0, instance1, unknown0)
+
+
+def label_objects(pair: ScanPair) -> tuple[ObjectRecord, ...]:
+    """The contract's rows of a pair's labels, each with its motion; points are not counted yet."""
+    by_id1 = {label.id: label for label in pair.labels1}
+    ids0 = {label.id for label in pair.labels0}
+    rows: list[tuple[LabelledBox | None, LabelledBox | None]] = [(a, by_id1.get(a.id)) for a in pair.labels0]
+    rows += [(None, label) for label in pair.labels1 if label.id not in ids0]
+    twist = ego_twist(pair.ego_motion, pair_interval(pair))
+    return tuple(_object(pair, twist, first, second) for first, second in rows)
 
 
 def pair_interval(pair: ScanPair) -> float:

@@ -140,15 +140,6 @@ class ScanPair:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedPair:
-    """A pair with all that depends on the source alone: whatever cars go in, this stays."""
-
-    scan0: PreparedScan
-    scan1: PreparedScan
-    movers0: Bool  # (N0,) points of scan 0 that contradict the ego-motion where the source's labels do not reach
-
-
-@dataclass(frozen=True, eq=False)
 class CarModel:
     """A car's mesh in its own frame: x forward, y left, z up, metres, origin at the centre of its bounding box."""
 
@@ -205,6 +196,26 @@ class ObjectRecord:
     speed: float | None = None
     yaw_rate: float | None = None
     steering: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledObjects:
+    """The source's own objects of a pair, and the measured points that are theirs."""
+
+    objects: tuple[ObjectRecord, ...]  # point counts not yet filled in
+    instance0: I16  # (N0,) row in `objects` of each valid point of scan 0; -1 for none
+    instance1: I16  # (N1,)
+    unknown0: Bool  # (N0,) points whose flow the labels leave open
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedPair:
+    """A pair with all that depends on the source alone: whatever cars go in, this stays."""
+
+    scan0: PreparedScan
+    scan1: PreparedScan
+    labelled: LabelledObjects
+    movers0: Bool  # (N0,) points of scan 0 that contradict the ego-motion where the source's labels do not reach
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,6 @@ PAIRS_OF_A_SEQUENCE, ROUNDS = 32, 3
 CONFIG = Config()
 PLAIN = {"use_dictionary": False, "write_statistics": False, "compression": "zstd", "compression_level": 1}
 STAGES = (
-    "label_points",
     "make_scene",
     "propose_car",
     "cast_and_measure",

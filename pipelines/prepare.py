@@ -2,10 +2,10 @@
 
 Reads: the planned pairs' `.bin` files, timestamps, OXTS, poses, calibration.
 Writes: `CACHE/prepared/<2 digits>/<digest>.arrays`, one file a scan (rays, ground, drivable region) and one a pair
-(ego-motion, unlabelled movers). A file's name is the digest of all that its content depends on: the scan's bytes and
-times, the sections of the configuration that matter, the scanner profile, the program. So neighbouring pairs, other
-seeds and other cars find what is there, and nothing stale is ever read. Pickle is never loaded; a damaged file is made
-again.
+(ego-motion, labelled points, unlabelled movers). A file's name is the digest of all that its content depends on: the
+scan's bytes and times, the labels, the sections of the configuration that matter, the scanner profile, the program. So
+neighbouring pairs, other seeds and other cars find what is there, and nothing stale is ever read. Pickle is never
+loaded; a damaged file is made again.
 """
 
 from functools import partial
@@ -23,12 +23,24 @@ from augkitti.kitti import (
     Sequence,
     ego_motion_digest,
     label_reach,
+    labels_digest,
     read_ego_motion,
     read_pair,
     read_scan,
     scan_digest,
 )
-from augkitti.scan_pair import NO_TICK, DrivableRegion, GroundMap, PreparedPair, PreparedScan, Scan, ScanPair, ScanRays
+from augkitti.labelled_objects import label_objects
+from augkitti.scan_pair import (
+    NO_TICK,
+    DrivableRegion,
+    GroundMap,
+    LabelledObjects,
+    PreparedPair,
+    PreparedScan,
+    Scan,
+    ScanPair,
+    ScanRays,
+)
 from augkitti.scanner import ScannerProfile, fire_rays
 from pipelines.cache import entry_path, load, store, trim
 from pipelines.stage import run_tasks
@@ -139,7 +151,8 @@ def prepared_pair(
     scan0, scan1 = (prepared_scan(sequence, frame0 + k, profile, config, cache_folder)[0] for k in (0, 1))
     scans = (scan0.scan, scan1.scan)
     coverage, azimuth = label_reach(sequence)
-    parts = [ego_motion_digest(sequence, frame0), coverage, azimuth, _sections(config, "ground", "drivable", "movers")]
+    parts: list[Any] = [ego_motion_digest(sequence, frame0), labels_digest(sequence, frame0), coverage, azimuth]
+    parts += [_sections(config, "ground", "drivable", "movers")]
     path = entry_path(cache_folder, ["pair", *parts, profile.digest])
     content = load(path)
     if content is not None:
@@ -147,14 +160,40 @@ def prepared_pair(
         if T is not None and source in ("oxts", "poses", "registration", "truth") and is_rigid(T, 1e-9):
             pair = read_pair(sequence, frame0, scans, EgoMotion(T, source))  # type: ignore[arg-type]
             try:
-                return pair, PreparedPair(scan0, scan1, _bits(bits, (len(scan0.scan),))), False
-            except (TypeError, ValueError):
+                movers0 = _bits(bits, (len(scan0.scan),))
+                return pair, PreparedPair(scan0, scan1, _unpack_labelled(content, pair), movers0), False
+            except (KeyError, IndexError, TypeError, ValueError):
                 pass  # damaged or foreign: made again below
     pair = read_pair(sequence, frame0, scans, read_ego_motion(sequence, frame0, *scans))
     prepared = prepare_pair(pair, scan0, scan1, config)
     content = {"T_velo1_velo0": pair.ego_motion, "source": np.array(pair.ego_source)}
-    store(path, content | {"movers0": np.packbits(prepared.movers0)})
+    store(path, content | {"movers0": np.packbits(prepared.movers0)} | _pack_labelled(prepared.labelled))
     return pair, prepared, True
+
+
+def _pack_labelled(labelled: LabelledObjects) -> dict[str, Any]:
+    """Which points are whose: few are anyone's."""
+    owned = [np.flatnonzero(instance >= 0).astype(np.int32) for instance in (labelled.instance0, labelled.instance1)]
+    return {
+        "owned0": owned[0],
+        "owner0": labelled.instance0[owned[0]],
+        "owned1": owned[1],
+        "owner1": labelled.instance1[owned[1]],
+        "unknown0": np.packbits(labelled.unknown0),
+    }
+
+
+def _unpack_labelled(packed: dict[str, Any], pair: ScanPair) -> LabelledObjects:
+    objects = label_objects(pair)
+    instances = []
+    for k, scan in enumerate((pair.scan0, pair.scan1)):
+        instance = np.full(len(scan), -1, dtype=np.int16)
+        owner = packed[f"owner{k}"]
+        if len(owner) and not 0 <= int(owner.min()) <= int(owner.max()) < len(objects):
+            raise ValueError("points of an object that is not there")
+        instance[packed[f"owned{k}"]] = owner
+        instances.append(instance)
+    return LabelledObjects(objects, instances[0], instances[1], _bits(packed["unknown0"], (len(pair.scan0),)))
 
 
 def _sections(config: Config, *names: str) -> dict[str, Any]:
