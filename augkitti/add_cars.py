@@ -25,6 +25,7 @@ from augkitti.raycast import CarHits, bearings_of, box_corners, cast_mesh, cross
 from augkitti.scan_pair import (
     I16,
     MEASURED,
+    MIXED,
     NO_TICK,
     AugmentedPair,
     AugmentedScan,
@@ -110,7 +111,8 @@ def occlude_both(
 
 def seen_well_enough(occluded: tuple[Occluded, Occluded], cars: int, min_points: int) -> bool:
     """Whether every car keeps at least `min_points` returns in both scans once all hide each other."""
-    counts = [np.bincount(scan.simulated.car, minlength=cars) for scan in occluded]
+    own = [scan.simulated.car[scan.simulated.surface != MIXED] for scan in occluded]
+    counts = [np.bincount(its, minlength=cars) for its in own]
     return all(int(count.min(initial=min_points)) >= min_points for count in counts)
 
 
@@ -191,7 +193,7 @@ def finish_pair(
         replace(item, points0=int(counts0[row]), points1=int(counts1[row])) for row, item in enumerate(objects)
     )
     open_flow = labelled.unknown0 | (prepared.movers0 & (labelled.instance0 < 0))
-    unknown0 = np.concatenate([open_flow[occluded0.kept], np.zeros(len(occluded0.simulated.xyz), dtype=bool)])
+    unknown0 = np.concatenate([open_flow[occluded0.kept], occluded0.simulated.surface == MIXED])
     flow0, status0 = scene_flow(columns0, pair.ego_motion, counted, unknown0)
     return AugmentedPair(
         pair_id=pair_id,
@@ -230,7 +232,7 @@ def _columns(prepared: PreparedScan, occluded: Occluded, instance: I16, first_ca
         ring=joined(rays.ring, new.ring),
         tick=joined(rays.tick, new.tick),
         source=joined(scan.row, np.full(len(new.xyz), -1, dtype=np.int32)),
-        instance=joined(instance, new.car + first_car),
+        instance=joined(instance, np.where(new.surface == MIXED, -1, new.car + first_car)),
         surface=np.concatenate([np.full(measured, MEASURED, dtype=np.uint8), new.surface]),
         removed=scan.row[~occluded.kept],
     )

@@ -7,6 +7,7 @@ where the real vehicle hid what is behind it, the nearest ray of the same ring t
 meets that passes all panes.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -19,8 +20,8 @@ from augkitti.frames import F32, F64, box_pose, compose, invert, pose_from_xyz_y
 from augkitti.labelled_views import TRIM_M, VehicleView, car_points
 from augkitti.raycast import CarHits, cast_car
 from augkitti.scan_pair import MEASURED, U8, Bool, CarModel
-from augkitti.scanner import ScannerProfile, lines_of_rays
-from augkitti.sensor_noise import CarLook, simulate_returns
+from augkitti.scanner import ScannerProfile, azimuth_time, lines_of_rays
+from augkitti.sensor_noise import CarLook, CarReturns, simulate_returns
 
 MOST_SCALED = 0.08  # a model is stretched by at most this share along each axis: the next body is as far away
 _STEP = 0.01  # of scale factors: alike boxes share a mesh
@@ -78,12 +79,30 @@ class CastInPlace:
 
 def cast_in_place(view: VehicleView, model: CarModel, profile: ScannerProfile, config: Config) -> CastInPlace:
     """Stretch a model to a view's box, cast it, and find what the rays measure without the vehicle."""
-    fitted = stretched(model, view.box[3:6])
-    T_velo_car = pose_in_box(fitted, view.box)
+    return cast_fitted(view, stretched(model, view.box[3:6]), profile, config.glass == "opaque")
+
+
+def cast_fitted(
+    view: VehicleView, model: CarModel, profile: ScannerProfile, opaque_glass: bool, velocity: F64 | None = None
+) -> CastInPlace:
+    """`cast_in_place` of a model as it is, on its way while it is swept.
+
+    Args:
+        velocity: (3,) metres a second against the scanner, velo; None for a car that stands.
+    """
+    rays = view.scan.rays
+    T_velo_car = pose_in_box(model, view.box)
     T_car_velo = np.broadcast_to(invert(T_velo_car), (len(view.ray), 4, 4))
-    hits = cast_car(fitted, T_car_velo, view.scan.rays, view.ray, profile, config.glass == "opaque")
+    if velocity is not None:
+        period = view.scan.scan.period_s
+        moment = azimuth_time(math.atan2(view.box[1], view.box[0]), period)
+        late = (rays.ray_time_s[view.ray] - moment + 0.5 * period) % period - 0.5 * period
+        ahead = np.broadcast_to(np.eye(4), (len(view.ray), 4, 4)).copy()
+        ahead[:, :3, 3] = -late[:, None] * velocity  # the scanner's view of then, carried to the car's moment
+        T_car_velo = compose(T_car_velo[0], ahead)
+    hits = cast_car(model, T_car_velo, rays, view.ray, profile, opaque_glass)
     without_m, without_reflectance = without_vehicle(view, profile)
-    return CastInPlace(fitted, T_velo_car, hits, np.isin(view.ray, hits.ray), without_m, without_reflectance)
+    return CastInPlace(model, T_velo_car, hits, np.isin(view.ray, hits.ray), without_m, without_reflectance)
 
 
 def measure_in_place(
@@ -96,16 +115,9 @@ def measure_in_place(
 ) -> Resimulated:
     """Send the pulses of a cast model; the nearest event along each ray wins, as in `occlusion`."""
     returns = simulate_returns(cast.hits, look, view.scan.rays, profile, config.glass == "opaque", rng)
-    measured, reflectance = cast.without_m.copy(), cast.without_reflectance.copy()
-    surface = np.full(len(view.ray), MEASURED, dtype=np.uint8)
+    measured, reflectance, surface = nearest_in_place(cast, returns)
     expected = np.full(len(view.ray), np.inf)
     expected[cast.row] = cast.hits.range_m[:, 0]
-    wins = returns.stop_m < measured[cast.row]
-    rows = np.flatnonzero(cast.row)[wins]
-    seen = returns.returned[wins]
-    measured[rows] = np.where(seen, returns.range_m[wins], np.inf)
-    reflectance[rows] = np.where(seen, returns.reflectance[wins], np.nan)
-    surface[rows] = np.where(seen, returns.surface[wins], MEASURED)
     return Resimulated(
         model=cast.model,
         T_velo_car=cast.T_velo_car,
@@ -117,6 +129,21 @@ def measure_in_place(
         expected_m=expected,
         points=car_points(view, profile, measured),
     )
+
+
+def nearest_in_place(cast: CastInPlace, returns: CarReturns) -> tuple[F64, F32, U8]:
+    """Range, reflectance and surface (K,) along a view's rays: the car's where it stops the pulse first.
+
+    As in `Resimulated`.
+    """
+    measured, reflectance = cast.without_m.copy(), cast.without_reflectance.copy()
+    surface = np.full(len(measured), MEASURED, dtype=np.uint8)
+    wins = returns.stop_m < measured[cast.row]
+    rows, seen = np.flatnonzero(cast.row)[wins], returns.returned[wins]
+    measured[rows] = np.where(seen, returns.range_m[wins], np.inf)
+    reflectance[rows] = np.where(seen, returns.reflectance[wins], np.nan)
+    surface[rows] = np.where(seen, returns.surface[wins], MEASURED)
+    return measured, reflectance, surface
 
 
 def best_model(models: Sequence[CarModel], box: F64, category: str = "Car") -> CarModel:

@@ -1,7 +1,8 @@
 """Sensor noise: the surfaces that rays meet on one car in, what the scanner returns of them out.
 
-Figures come from the `noise` part of the scanner profile, learned from labelled vehicles (`pipelines.fit_vehicles`);
-here is only their form. `simulate_returns` is the seam for another model: same arguments, same result.
+Figures come from the `noise` part of the scanner profile, learned from labelled vehicles (`pipelines.fit_vehicles`) and
+from smooth surfaces (`pipelines.fit_noise`, key `solid`: shot noise with its tails, isolated drops, range steps); here
+is only their form. `simulate_returns` is the seam for another model: same arguments, same result.
 
 An echo has a strength: the surface's own, the car's paint, incidence, range, and chance, in units of chance's standard
 deviation. Below 0 nothing returns; up to a threshold the return has reflectance 0; above it, reflectance grows with
@@ -23,6 +24,7 @@ from scipy.special import expit, ndtr, ndtri
 from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import F64
+from augkitti.range_noise import NoiseProfile, isolated_misses, noise_from_content, shot_error
 from augkitti.raycast import CarHits
 from augkitti.scan_pair import GLASS, LAMP, MEASURED, OTHER, PAINT, THROUGH_GLASS, TYRE, U8, Bool, ScanRays
 from augkitti.scanner import ScannerProfile
@@ -30,6 +32,7 @@ from augkitti.scanner import ScannerProfile
 _FIRINGS = 2150  # azimuth bins of a noise field: one a firing
 _RING_STEP_RAD = 0.0075  # between beams, between that of the upper and of the lower block (scanner.md section 1)
 _LATE = 4.0 / 3.0  # stray ranges lie from a third of the most before the surface to the most behind it
+_MOST_SHOT_M = 0.04  # contract, invariant 4 allows 0.25 m in all: biases, relief and strays take 0.21 m of it
 _MOST_STEPS = 12  # of a frame's half width: beside the scanner it would cover the car
 
 
@@ -143,12 +146,26 @@ def noise_model(profile: ScannerProfile) -> NoiseModel:
     Raises:
         InputError: the profile has no `noise` part, or a key of it is wrong.
     """
+    content = profile.content.get("noise")
+    if content is None:
+        raise InputError(profile.name, "has no `noise`", "run `augkitti fit-noise --profile FOLDER`, which adds it")
     try:
-        return NoiseModel.model_validate(profile.content.get("noise"))
+        return NoiseModel.model_validate(content)
     except ValidationError as err:
         first = err.errors()[0]
         key = ".".join(str(part) for part in ("noise", *first["loc"]))
         raise InputError(profile.name, f"key `{key}`: {first['msg']}", "see the shipped scanner profile") from err
+
+
+@lru_cache(maxsize=8)
+def solid_noise(profile: ScannerProfile) -> NoiseProfile | None:
+    """The learned noise of solid surfaces in a profile; None where it has none: constants stand for it.
+
+    Raises:
+        InputError: the part is damaged.
+    """
+    content = (profile.content.get("noise") or {}).get("solid")
+    return None if content is None else noise_from_content(content, profile.range_bias_m, profile.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +185,7 @@ class CarReturns:
     range_m: F64  # (K,) as measured: bias, noise and range steps included
     reflectance: F64  # (K,) 0 to 0.99 in the scanner's steps
     surface: U8  # (K,)
+    edge_luck: F64 | None = None  # (2, K) from 0 to 1: what becomes of the ray where it is the last before a range step
 
 
 def simulate_returns(
@@ -187,7 +205,7 @@ def simulate_returns(
     pane_chance = grid.draw(model.glass_clump, rng)
     relief = grid.draw_smooth(model.relief.firing, model.relief.beam, rng)
     white = rng.standard_normal((2, count))
-    luck = rng.random((3, count))
+    luck = rng.random((6, count))
 
     outside = hits.surface[:, 0] if count else np.zeros(0, dtype=np.uint8)
     cosine = hits.cos_incidence[:, 0] if count else np.zeros(0)
@@ -207,12 +225,22 @@ def simulate_returns(
         surface[through] = THROUGH_GLASS
         reflectance[through] = _through_glass(1.0 - depth, model, profile)
 
-    returned &= luck[2] >= model.isolated_drop
     true_m = np.where(np.isfinite(stop), stop, 0.0)
-    error = _range_error(cosine, surface, relief, white, luck[0], model)
+    solid = solid_noise(profile)
+    if solid is None:
+        returned &= luck[2] >= model.isolated_drop
+    else:
+        returned &= ~isolated_misses(solid, ring, true_m, cosine, reflectance, luck[2])
+    inside = surface == THROUGH_GLASS
+    rough = np.where(inside, 0.0, model.relief.rough_m / np.maximum(cosine, 0.1))
+    error = _shape_error(inside, relief, white[1], luck[0], model)
+    if solid is None:
+        error += white[0] * sm.hypot(model.shot_std_m, rough)
+    else:
+        error += np.clip(shot_error(solid, true_m, white[0], luck[3], rough), -_MOST_SHOT_M, _MOST_SHOT_M)
     measured = quantise_range(true_m + profile.range_bias_m[ring] + error, ring, profile)
     returned &= (measured >= profile.min_range_m) & (measured <= profile.max_range_m)
-    return CarReturns(stop, returned, measured, reflectance, surface)
+    return CarReturns(stop, returned, measured, reflectance, surface, luck[4:])
 
 
 def quantise_range(range_m: F64, ring: U8, profile: ScannerProfile) -> F64:
@@ -290,15 +318,13 @@ def _in_steps(value: F64, profile: ScannerProfile) -> F64:
     return np.asarray(steps * profile.reflectance_quantum)
 
 
-def _range_error(cosine: F64, surface: U8, relief: F64, white: F64, luck: F64, model: NoiseModel) -> F64:
-    """Error (K,) metres beside the beam's bias: shot noise, roughness, relief, stray ranges."""
-    inside, part = surface == THROUGH_GLASS, model.relief
-    rough = np.where(inside, 0.0, part.rough_m / np.maximum(cosine, 0.1))
+def _shape_error(inside: Bool, relief: F64, stray: F64, luck: F64, model: NoiseModel) -> F64:
+    """Error (K,) metres beside the beam's bias and its shot noise: relief, stray ranges."""
+    part = model.relief
     # Late rather than early: towards the scanner an error leaves the car's box, which may be sheared by the sweep too.
-    stray = part.most_m * (_LATE * ndtr(white[1]) - (_LATE - 1.0))
-    shape = part.std_m * relief + np.where(luck < part.stray, stray, 0.0)
-    shape = np.where(inside, 0.0, np.clip(shape, -(_LATE - 1.0) * part.most_m, part.most_m))
-    return np.asarray(white[0] * sm.hypot(model.shot_std_m, rough) + shape)
+    late = part.most_m * (_LATE * ndtr(stray) - (_LATE - 1.0))
+    shape = part.std_m * relief + np.where(luck < part.stray, late, 0.0)
+    return np.where(inside, 0.0, np.clip(shape, -(_LATE - 1.0) * part.most_m, part.most_m))
 
 
 class FieldGrid:

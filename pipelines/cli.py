@@ -72,7 +72,7 @@ Glass = Annotated[Literal["pass", "opaque"] | None, typer.Option(help="Whether p
 Shutter = Annotated[
     Literal["rolling", "snapshot"] | None, typer.Option(help="Each ray at its own firing time, or all at once.")
 ]
-Profile = Annotated[Path | None, typer.Option(help="Scanner profile (JSON). Without: KITTI's HDL-64E.")]
+Profile = Annotated[Path | None, typer.Option(help="Scanner profile (JSON, or its folder). Without: KITTI's HDL-64E.")]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings (YAML); see `augkitti config show`.")]
 OnError = Annotated[Literal["skip", "stop"], typer.Option(help="Leave out pairs whose source is unreadable, or stop.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run.")]
@@ -354,6 +354,44 @@ def fit_sensor(
         from pipelines.fit_sensor import fit_sensor as run
 
         run(_needed(kitti), out, json)
+
+
+@app.command("fit-noise")
+def fit_noise(
+    kitti: Kitti = None,
+    profile: Annotated[
+        Path, typer.Option(metavar="DIR", help="Profile's folder, written; its profile.json, if any, is the scanner.")
+    ] = Path("profile"),
+    cad: Cad = None,
+    no_compare: Annotated[
+        bool, typer.Option("--no-compare", help="Do not judge models on drives left out; one drive is enough then.")
+    ] = False,
+    no_vehicles: Annotated[
+        bool, typer.Option("--no-vehicles", help="Leave what labelled vehicles return as it is.")
+    ] = False,
+    seed: Seed = 0,
+) -> None:
+    """Learn range noise, drops, range steps and what vehicles return from raw scans; needs torch (extra `fit`)."""
+    with _answers():
+        from pipelines.fit_noise import fit_noise as run
+
+        run(_needed(kitti), profile, cad, compare=not no_compare, vehicles=not no_vehicles, seed=seed)
+
+
+@app.command("judge-noise")
+def judge_noise(
+    kitti: Kitti = None,
+    profile: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder that `augkitti fit-noise` wrote. Without: the shipped."),
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
+) -> None:
+    """Print how well a noise profile foretells any raw scans: a constant, both models, the shipped one."""
+    with _answers():
+        from pipelines.judge_noise import judge_noise as run
+
+        run(_needed(kitti), profile, json)
 
 
 @config_app.command("show")

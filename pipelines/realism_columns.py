@@ -14,12 +14,12 @@ import numpy as np
 
 from augkitti import kitti as kitti_disk
 from augkitti import realism_features as rf
-from augkitti.frames import F64, Array, compose, invert
+from augkitti.frames import F64, Array, invert
 from augkitti.labelled_views import GROW_M, VehicleView, rays_at
 from augkitti.raycast import CarHits, cast_car
-from augkitti.resimulate import CastInPlace, best_model, pose_in_box, stretched, without_vehicle
+from augkitti.resimulate import best_model, cast_fitted, nearest_in_place, pose_in_box, stretched
 from augkitti.scan_pair import GLASS, MEASURED, AugmentedPair, CarModel, ScanRays
-from augkitti.scanner import ScannerProfile, azimuth_time, fire_rays, lines_of_rays, profile_from_content
+from augkitti.scanner import ScannerProfile, fire_rays, lines_of_rays, profile_from_content
 from augkitti.sensor_noise import CarLook, CarReturns, quantise_range, simulate_returns
 
 COLUMNS = {  # what stands beside the real cars: name, and what it says in the report
@@ -104,7 +104,7 @@ def simulate(
     if column == "common":
         return _common_car(view, model, *common, rng)
     opaque = column == "opaque"
-    cast = _cast_moving(view, model, velocity * (column != "snapshot"), profile, opaque)
+    cast = cast_fitted(view, model, profile, opaque, velocity * (column != "snapshot"))
     if column == "all_pass":
         cast = replace(cast, hits=without_panes(cast.hits))
         cast = replace(cast, row=np.isin(view.ray, cast.hits.ray))
@@ -115,33 +115,8 @@ def simulate(
         returns = without_noise(cast.hits, returns, view.scan.rays, profile)
     if column == "independent":
         returns = with_independent_drops(cast.hits, returns, rng)
-    measured, reflectance = _nearest(cast, returns)
+    measured, reflectance, _ = nearest_in_place(cast, returns)
     return rf.car_rays(view.scan.rays, view.ray, measured, reflectance, view.box, profile)
-
-
-def _cast_moving(
-    view: VehicleView, model: CarModel, velocity: F64, profile: ScannerProfile, opaque: bool
-) -> CastInPlace:
-    """`resimulate.cast_in_place` with the car on its way while it is swept: `velocity` is against the scanner."""
-    rays, period = view.scan.rays, view.scan.scan.period_s
-    pose = pose_in_box(model, view.box)
-    moment = azimuth_time(math.atan2(view.box[1], view.box[0]), period)
-    late = (rays.ray_time_s[view.ray] - moment + 0.5 * period) % period - 0.5 * period
-    ahead = np.broadcast_to(np.eye(4), (len(view.ray), 4, 4)).copy()
-    ahead[:, :3, 3] = -late[:, None] * velocity  # the scanner's view of then, carried to the car's moment
-    hits = cast_car(model, compose(invert(pose), ahead), rays, view.ray, profile, opaque)
-    without_m, without_reflectance = without_vehicle(view, profile)
-    return CastInPlace(model, pose, hits, np.isin(view.ray, hits.ray), without_m, without_reflectance)
-
-
-def _nearest(cast: CastInPlace, returns: CarReturns) -> tuple[F64, Array]:
-    """Range and reflectance (K,) along the view's rays: of the car where it stops the pulse first."""
-    measured, reflectance = cast.without_m.copy(), cast.without_reflectance.copy()
-    wins = returns.stop_m < measured[cast.row]
-    rows, seen = np.flatnonzero(cast.row)[wins], returns.returned[wins]
-    measured[rows] = np.where(seen, returns.range_m[wins], np.inf)
-    reflectance[rows] = np.where(seen, returns.reflectance[wins], np.nan)
-    return measured, reflectance
 
 
 def without_panes(hits: CarHits) -> CarHits:

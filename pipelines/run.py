@@ -32,6 +32,7 @@ from augkitti.kitti import KittiRoot, Sequence, known_ego_motion, label_reach, o
 from augkitti.remote import as_path, copy_here, is_remote, remove_all
 from augkitti.scan_pair import CarModel
 from augkitti.scanner import ScannerProfile, load_profile
+from augkitti.sensor_noise import noise_model, solid_noise
 from augkitti.shards import read_metadata, shard_metadata
 from pipelines.cache import cache_folder, program_digest
 from pipelines.lock import NAME as LOCK_NAME
@@ -62,8 +63,16 @@ class Options:
 
     @cached_property
     def scanner(self) -> ScannerProfile:
-        """The scanner profile."""
-        return load_profile(self.profile)
+        """The scanner profile.
+
+        Raises:
+            InputError: it is none, or has no noise that virtual cars could return by.
+        """
+        profile = load_profile(self.profile)
+        if self.config.cars[1] > 0:  # once here, not as the reason of every pair that is skipped
+            noise_model(profile)
+            solid_noise(profile)
+        return profile
 
     @property
     def models(self) -> tuple[CarModel, ...]:
