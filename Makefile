@@ -8,7 +8,7 @@ CAD ?= ../shared/cad
 STREETS ?= build/streets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo realism test fuzz trust check lint types bench clean
+.PHONY: help demo realism test fuzz trust check lint types bench checkpoint table1 clean
 
 help: ## this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -55,6 +55,23 @@ bench: $(STAMP) ## speed and accuracy figures of docs/figures.md, on KITTI=, CAD
 	$(BIN)/python benchmarks/generate.py $(KITTI) $(CAD)
 	$(BIN)/python benchmarks/street_vs_real.py $(KITTI) $(STREETS)
 	$(BIN)/python benchmarks/network.py $(KITTI)
+
+STEPS ?= 3600
+
+build/k/splits.json: $(STAMP)
+	$(BIN)/augkitti generate --n 400 --out build/ak --jobs 2
+	$(BIN)/augkitti generate --n 400 --cars 0 --out build/k --jobs 2
+	$(BIN)/augkitti split build/ak
+	$(BIN)/augkitti split build/k --like build/ak/splits.json
+
+checkpoint: build/k/splits.json ## the shipped checkpoint, trained on embedded streets: 40 minutes on two cores, into build/shipped
+	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m training train --data build/k --data build/ak \
+	  --config small --steps $(STEPS) --threads 1 --out build/shipped
+	$(BIN)/pointflownet export build/shipped --out training/checkpoints/small.pt
+	$(BIN)/pointflownet evaluate training/checkpoints/small.pt --data build/k --data build/ak --split test --json build/shipped/test.json
+
+table1: build/k/splits.json ## what augmented pairs add to plain ones, in small: an hour on two cores, into build/table1
+	$(BIN)/python benchmarks/table1.py build/k build/ak
 
 clean: ## remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build *.egg-info
