@@ -11,7 +11,7 @@ STREETS ?= build/streets
 .PHONY: help demo realism test fuzz trust check lint types bench checkpoint table1 clean
 
 help: ## this list
-	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+	@grep -E '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("augkitti needs Python 3.11 to 3.13; set PYTHON=") if not (3, 11) <= sys.version_info[:2] <= (3, 13) else None'
@@ -53,20 +53,26 @@ bench: $(STAMP) ## speed and accuracy figures of docs/figures.md, on KITTI=, CAD
 	$(BIN)/python benchmarks/cad_library.py $(CAD)
 	$(BIN)/python benchmarks/window_shares.py $(KITTI) $(CAD)
 	$(BIN)/python benchmarks/generate.py $(KITTI) $(CAD)
+	$(BIN)/python benchmarks/workers.py $(KITTI) $(CAD)
+	$(BIN)/python benchmarks/workers.py $(KITTI) $(CAD) --memory 100 2000 --jobs 2
+	$(BIN)/python benchmarks/encodings.py $(KITTI) $(CAD)
+	$(BIN)/python benchmarks/million.py
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt open3d libusb-package
+	$(BIN)/python benchmarks/casting.py $(KITTI) $(CAD) --rounds 3
 	$(BIN)/python benchmarks/street_vs_real.py $(KITTI) $(STREETS)
 	$(BIN)/python benchmarks/network.py $(KITTI)
 
-STEPS ?= 3600
+STEPS ?= 4000
 
-build/k/splits.json: $(STAMP)
-	$(BIN)/augkitti generate --n 400 --out build/ak --jobs 2
-	$(BIN)/augkitti generate --n 400 --cars 0 --out build/k --jobs 2
+build/k/splits.json: | $(STAMP)
+	env -u AUGKITTI_KITTI $(BIN)/augkitti generate --n 400 --out build/ak --jobs 2 --resume
+	env -u AUGKITTI_KITTI $(BIN)/augkitti generate --n 400 --cars 0 --out build/k --jobs 2 --resume
 	$(BIN)/augkitti split build/ak
 	$(BIN)/augkitti split build/k --like build/ak/splits.json
 
 checkpoint: build/k/splits.json ## the shipped checkpoint, trained on embedded streets: 40 minutes on two cores, into build/shipped
-	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m training train --data build/k --data build/ak \
-	  --config small --steps $(STEPS) --threads 1 --out build/shipped
+	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m training train --data build/k=0.25 --data build/ak \
+	  --config small --steps $(STEPS) --threads 1 --out build/shipped $(if $(wildcard build/shipped/checkpoint.pt),--resume)
 	$(BIN)/pointflownet export build/shipped --out training/checkpoints/small.pt
 	$(BIN)/pointflownet evaluate training/checkpoints/small.pt --data build/k --data build/ak --split test --json build/shipped/test.json
 

@@ -9,8 +9,7 @@ from augkitti.frames import box_pose, compose, footprint_corners, footprints_ove
 from tests import hand_made_pair, pair_factory
 from training.augment_sample import augment_sample, flip, move_objects, scale, turn
 from training.config import TrainConfig
-from training.sample import Sample, sample_of
-from training.voxelize import is_labelled
+from training.sample import Sample, is_labelled, sample_of
 
 WILD = TrainConfig(rotation_rad=3.0, scale=0.4, flip=True, box_rotation_rad=0.8, box_shift_m=1.5)
 STILL = TrainConfig(rotation_rad=0.0, scale=0.0, flip=False, box_rotation_rad=0.0, box_shift_m=0.0)

@@ -8,8 +8,9 @@ from typer.testing import CliRunner
 
 torch = pytest.importorskip("torch")
 
+from tiny_network import tiny_settings  # noqa: E402
+
 from augkitti.errors import InputError, MachineError  # noqa: E402
-from tests.tiny_network import tiny_settings  # noqa: E402
 from training.checkpoint import (  # noqa: E402
     FORMAT,
     NAME,

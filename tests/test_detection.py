@@ -128,8 +128,11 @@ def test_a_cars_best_anchor_is_positive_however_little_it_overlaps():
 
 
 def test_a_car_whose_centre_is_outside_the_grid_has_no_anchor():
-    labels, _ = match(np.array([car(-0.5, 0.0), car(16.5, 0.0), car(8.0, -40.0)]), NONE, TINY)
-    assert (labels == NEGATIVE).all()
+    labels, _ = match(np.array([car(-0.5, 0.4), car(8.0, -40.0)]), NONE, TINY)
+    assert not (labels == POSITIVE).any()
+    assert labels[0, *cell_of(0.4, 0.4)] == LEFT_OUT  # on the car
+    assert labels[1, *cell_of(0.4, 0.4)] == NEGATIVE  # across it
+    assert (labels[:, *cell_of(4.4, 0.4)] == NEGATIVE).all()
 
 
 def test_anchors_on_a_neutral_box_are_left_out_but_not_those_of_a_car_beside_it():

@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hand_made_pair import make_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from augkitti.errors import InputError
 from augkitti.frames import pose_from_xyz_yaw, transform_points
-from tests.hand_made_pair import make_pair
 from training.config import GridConfig, NetworkConfig, Settings, load_settings
 from training.detection import LEFT_OUT, NEGATIVE, POSITIVE, anchors
 from training.sample import Sample, sample_of
@@ -340,5 +340,6 @@ def test_reach_of_labels_is_an_arc_that_may_pass_straight_behind():
     xy = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.1], [-1.0, -0.1], [0.0, -1.0]])
     assert is_labelled(xy, "camera", (-0.7, 0.7)).tolist() == [True, False, False, False, False]
     assert is_labelled(xy, "camera", (1.5, 3.5)).tolist() == [False, True, True, True, False]
+    assert is_labelled(xy, "camera", (1.5, 3.5 - 2 * np.pi)).tolist() == [False, True, True, True, False]
     assert is_labelled(xy, "full", None).all()
     assert not is_labelled(xy, "none", None).any()

@@ -4,10 +4,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from pair_factory import make_pair, metadata, write_whole_index
+
 from augkitti.dataset_index import read_index, shard_entry
 from augkitti.shards import write_shard
 from augkitti.splits import Splits, write_splits
-from tests.pair_factory import make_pair, metadata, write_whole_index
 
 TRAIN, VALIDATION, TEST = "0001", "0002", "0003"
 

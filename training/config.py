@@ -57,13 +57,21 @@ class NetworkConfig(_Section):
         ((128, 4), (128, 6), (256, 6)), description="width and number of layers of each 2D block, the first of stride 2"
     )
     upsampled: int = Field(256, description="channels of each up-convolution for detection")
-    upsampled_flow: int = Field(256, description="channels of each up-convolution for flow")
+    upsampled_flow: int = Field(64, description="channels of each up-convolution for flow")
     rigid: tuple[int, int] = Field((64, 5), description="width and number of layers of the rigid-motion decoder")
     ego: tuple[int, int] = Field((128, 3), description="width and number of strided layers of the ego-motion branch")
 
+    @model_validator(mode="after")
+    def _can_be_built(self) -> "NetworkConfig":
+        blocks = [number for block in self.blocks for number in block]
+        numbers = (*self.vfe, *self.middle, *blocks, self.upsampled, self.upsampled_flow, *self.rigid, *self.ego)
+        if not self.vfe or not self.blocks or min(numbers) < 1 or any(width % 2 for width in self.vfe):
+            raise ValueError("widths and depths are 1 or more, those of vfe even; vfe and blocks are not empty")
+        return self
+
 
 class LossConfig(_Section):
-    """Weights that the paper does not print; chosen by validation."""
+    """Weights that the paper does not print, set by hand (docs/decisions.md)."""
 
     alpha: float = Field(1.0, ge=0.0, description="scene flow")
     beta: float = Field(1.0, ge=0.0, description="rigid motion")

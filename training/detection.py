@@ -93,14 +93,20 @@ def match(
     config, at = settings.detection, anchors(settings)
     best_iou, best_box = np.zeros(at.shape[:3]), np.full(at.shape[:3], -1)
     bests: list[tuple[int, int]] = []  # box and its best anchor
+    outside: list[npt.NDArray[np.int64]] = []  # anchors on a box that is not asked for: scores take it as neutral, too
     for number, box in enumerate(boxes):
         near, iou = _overlaps(box, at, settings)
-        if not _centre_inside(box, settings.grid) or not len(near) or iou.max() <= 0.0:
+        if not _centre_inside(box, settings.grid):
+            outside.append(near[iou >= config.negative_iou])
+            continue
+        if not len(near) or iou.max() <= 0.0:
             continue
         better = iou > best_iou.flat[near]
         best_iou.flat[near[better]], best_box.flat[near[better]] = iou[better], number
         bests.append((number, near[iou.argmax()]))
     labels = np.where(best_iou < config.negative_iou, NEGATIVE, LEFT_OUT).astype(np.int8)
+    for near in outside:
+        labels.flat[near] = LEFT_OUT
     for box in neutral:
         near, iou = _overlaps(box, at, settings)
         labels.flat[near[iou >= config.negative_iou]] = LEFT_OUT

@@ -12,6 +12,7 @@ Flow is Eq. 1's, see `rigid_motion.flow_of` and the slips of print noted there.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 
@@ -163,6 +164,8 @@ def equivariance(out: Path, seeds: int = 5, steps: int = 300) -> list[Row]:
     """The command: train, print, draw."""
     if not out.parent.is_dir():  # minutes of training go before the picture
         raise InputError(out, "its folder does not exist", "name a PNG in a folder that exists")
+    if find_spec("matplotlib") is None:
+        raise InputError("matplotlib", "is not installed", "pip install 'augkitti[view]'")
     rows = run_experiment(seeds, steps)
     draw_chart(rows, out)
     print(f"{out} written")

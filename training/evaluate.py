@@ -22,6 +22,7 @@ from augkitti.dataset import Dataset, open_dataset
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
 from augkitti.scan_pair import AugmentedPair
+from augkitti.splits import SPLIT_NAMES
 from training.checkpoint import Checkpoint, load_checkpoint, network_of, shipped_checkpoint
 from training.config import Settings
 from training.network import PointFlowNet
@@ -109,10 +110,9 @@ def quick_figures(
     network: PointFlowNet, settings: Settings, data: Sequence[tuple[Path, float]], split: str, limit: int, team: Team
 ) -> dict[str, float | None]:
     """Figures for the training log, on pairs spread over the split; empty where a data set has none."""
-    try:
-        sets = [_open(folder, split) for folder, _ in data]
-    except InputError:
+    if why_no_figures(data, split) is not None:
         return {}
+    sets = [_open(folder, split) for folder, _ in data]
     predictor = Predictor(network, settings, team)
     each = max(limit // len(sets), 1)
     pairs = (one[k * len(one) // min(each, len(one))] for one in sets for k in range(min(each, len(one))))
@@ -120,6 +120,22 @@ def quick_figures(
     rows = {row["method"]: row for row in report.rows}
     wanted = ("fg_epe", "bg_epe", "obj_rot", "obj_tr_centre", "ego_rot", "ego_tr", "ap_bev50", "rigid_tr_local")
     return {**{name: rows["direct"][name] for name in wanted}, "fg_dense": rows["dense"]["fg_epe"]}
+
+
+def why_no_figures(data: Sequence[tuple[Path, float]], split: str) -> str | None:
+    """What is wrong with a split of some data sets; None where all have it.
+
+    Raises:
+        InputError: no split has that name.
+    """
+    if split not in SPLIT_NAMES:
+        raise InputError("--validation", f"`{split}` is no split", f"give {', '.join(SPLIT_NAMES)}, or none")
+    try:
+        for folder, _ in data:
+            _open(folder, split)
+    except InputError as err:
+        return str(err)
+    return None
 
 
 class _Sets:

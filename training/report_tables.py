@@ -90,17 +90,24 @@ def as_csv(report: Report) -> str:
 
 
 def as_latex(report: Report, evaluated_on: str = "") -> str:
-    """Rows for a `tabular` with the columns of the paper's Table 2; the best figure of each column in bold."""
+    """Rows for a `tabular` with the columns of the paper's Table 2; the best figure of each column in bold.
+
+    The true ego-motion is no method, so its row is never bold.
+    """
     best = {}
     for key in _PAPER:
-        shown = [_rounded(row[key], _digits(key)) for row in report.rows if row[key] is not None]
+        shown = [
+            _rounded(row[key], _digits(key))
+            for row in report.rows
+            if row[key] is not None and row["method"] != "ego_true"
+        ]
         best[key] = min(shown, key=float) if shown else None
     lines = []
     for row in report.rows:
         cells = []
         for key in _PAPER:
             text = _NONE if row[key] is None else _rounded(row[key], _digits(key))
-            cells.append(f"{{\\bf {text}}}" if text == best[key] else text)
+            cells.append(f"{{\\bf {text}}}" if text == best[key] and row["method"] != "ego_true" else text)
         lines.append(" & ".join([_escaped(evaluated_on), _escaped(row["method"]), *cells]) + r" \\")
     return "\n".join(lines) + "\n"
 

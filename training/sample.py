@@ -75,6 +75,14 @@ def sample_of(pair: AugmentedPair) -> Sample:
     )
 
 
+def is_labelled(xy: F64, coverage: str, azimuth: tuple[float, float] | None) -> Bool:
+    """Which places (..., 2) in velo0 the source's own labels reach (contract: `label_coverage`, `label_azimuth`)."""
+    if coverage == "camera" and azimuth is not None:
+        angle, width = np.arctan2(xy[..., 1], xy[..., 0]), (azimuth[1] - azimuth[0]) % (2.0 * np.pi)
+        return np.asarray((angle - azimuth[0]) % (2.0 * np.pi) <= width)
+    return np.full(np.shape(xy)[:-1], coverage == "full")
+
+
 def _renumbered(instance: I16, new_row: I64, pair_id: str) -> I64:
     if len(instance) and not -1 <= int(instance.min()) <= int(instance.max()) < len(new_row) - 1:
         raise InputError(pair_id, f"a point names none of its {len(new_row) - 1} objects", "generate it again")

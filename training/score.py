@@ -7,6 +7,7 @@ not at all.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -33,6 +34,7 @@ from training.metrics import (
 )
 from training.predictions import Prediction
 from training.rigid_motion import motion_of, world_to_local
+from training.sample import is_labelled
 
 I64 = npt.NDArray[np.int64]
 Predictor = Callable[[AugmentedPair], Prediction]
@@ -156,7 +158,7 @@ def truth_of(pair: AugmentedPair, rules: Rules) -> Truth:
     own_motion = translation_error(motions, pair.ego_motion[None], centres)
     own_motion[~has_motion] = np.nan
     virtual = np.array([item.origin == "virtual" for item in items], dtype=bool)
-    reach = _labels_reach(pair)
+    reach = partial(is_labelled, coverage=pair.label_coverage, azimuth=pair.label_azimuth)
     judged = counts[rows_of] & inside_grid(centres, rules.grid) & (virtual | reach(centres[:, :2]))
     near = (is_car | is_neutral)[rows_of]
     between = gaps_bev(boxes, boxes)
@@ -192,19 +194,6 @@ def truth_of(pair: AugmentedPair, rules: Rules) -> Truth:
         cell_motions=cell_motions,
         labels_reach=reach,
     )
-
-
-def _labels_reach(pair: AugmentedPair) -> Callable[[Array], Bool]:
-    """Where the source's labels reach, so that a detection without a label is a false one."""
-    azimuth = pair.label_azimuth
-
-    def reach(xy: Array) -> Bool:
-        if pair.label_coverage != "camera" or azimuth is None:
-            return np.full(len(xy), pair.label_coverage == "full")
-        width = (azimuth[1] - azimuth[0]) % (2 * np.pi)
-        return np.asarray((np.arctan2(xy[:, 1], xy[:, 0]) - azimuth[0]) % (2 * np.pi) <= width)
-
-    return reach
 
 
 def _cells_of_cars(pair: AugmentedPair, rows: I64, counts: Bool, grid: GridConfig) -> tuple[npt.NDArray[np.int32], F64]:

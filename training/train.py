@@ -82,6 +82,9 @@ def train(options: TrainOptions) -> Path:
         train_config, start = options.settings.train, time.perf_counter()
         with closing(Log(options.out, team, run.step)) as log, closing(batches_of(run.pairs, options)) as batches:
             log.say(run.headline(team))
+            reason = no_validation(options)
+            if reason:
+                log.say(f"no figures on the way: {reason}")
             while run.step < run.steps:
                 batch = next(batches).to(team.device)
                 if team.leads and not log.done:
@@ -264,11 +267,25 @@ def batches_of(pairs: ShardPairs, options: TrainOptions) -> Generator[Batch]:
     """Batches without end, epoch after epoch, from where `pairs` stands; it is moved on with each."""
     while True:
         at_start = deepcopy(pairs)  # worker processes begin when they begin; `pairs` may have moved on by then
-        epoch = load_batches(at_start, options.settings, options.workers, pin_memory=torch.cuda.is_available())
+        epoch = load_batches(
+            at_start,
+            options.settings,
+            options.workers,
+            pin_memory=options.device != "cpu" and torch.cuda.is_available(),
+        )
         for batch in islice(epoch, pairs.batches_left()):
             pairs.batch_done()
             yield batch
         pairs.set_epoch(pairs.epoch + 1)
+
+
+def no_validation(options: TrainOptions) -> str | None:
+    """Why there will be no figures of the validation split though they are wanted; None where there will be."""
+    if options.validation is None or not options.validate_every:
+        return None
+    from training.evaluate import why_no_figures
+
+    return why_no_figures(options.data, options.validation)
 
 
 def validate(run: Run, options: TrainOptions, team: Team) -> dict[str, float | None]:
@@ -381,7 +398,9 @@ def _refuse_nan(value: float, what: str, figures: Mapping[str, float], batch: Ba
         names = ", ".join(sample.pair_id for sample in batch.samples)
         parts = ", ".join(f"{name} {figure:g}" for name, figure in figures.items() if name != "loss")
         raise InputError(
-            f"batch of {names}", f"its {what} is {value} ({parts})", "lower train.learning_rate, go on with --resume"
+            f"batch of {names}",
+            f"its {what} is {value} ({parts})",
+            "lower train.learning_rate, and begin anew with --init",
         )
 
 

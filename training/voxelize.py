@@ -15,12 +15,13 @@ import numpy.typing as npt
 import torch
 
 from augkitti.errors import InputError
-from augkitti.frames import F32, F64
+from augkitti.frames import F32
 from augkitti.scan_pair import I64, Bool
 from augkitti.seeds import generator
 from training import detection
 from training.config import GridConfig, Settings
-from training.sample import Sample
+from training.rigid_motion import motion_of, world_to_local
+from training.sample import Sample, is_labelled
 
 FEWEST_POINTS = 5  # an object with fewer is no positive example, as the scores ignore it
 _Record = TypeVar("_Record", bound="Voxels | Targets | Batch")
@@ -173,7 +174,7 @@ def targets_of(samples: Sequence[Sample], settings: Settings) -> Targets:
         motion=motion,
         known=known,
         is_object=is_object,
-        ego=torch.from_numpy(np.stack([_planar(sample.ego_motion) for sample in samples]).astype(np.float32)),
+        ego=torch.from_numpy(motion_of(np.stack([sample.ego_motion for sample in samples])).astype(np.float32)),
         anchor_labels=torch.from_numpy(np.stack([labels for labels, _ in anchors])),
         anchor_residuals=torch.from_numpy(np.stack([residuals for _, residuals in anchors])),
     )
@@ -206,10 +207,10 @@ def column_targets(sample: Sample, grid: GridConfig) -> tuple[I64, F32, F32, Boo
     totals = [np.bincount(column, weights=sample.flow0[rows, k], minlength=len(columns)) for k in range(3)]
     flow = np.stack(totals, axis=1) / np.maximum(counted, 1)[:, None]
 
-    planar = np.stack([_planar(motion) for motion in (sample.ego_motion, *sample.motion)])
+    planar = motion_of(np.stack([sample.ego_motion, *sample.motion]))
     ix, iy = np.divmod(columns, grid.shape[1])
     places = np.stack([ix, iy], axis=1)
-    local = _about(planar[winner], column_centres(places, grid))
+    local = world_to_local(planar[winner], column_centres(places, grid))
     local[~is_known] = 0.0
     return places, flow.astype(np.float32), local.astype(np.float32), is_known, is_known & (winner > 0)
 
@@ -232,14 +233,6 @@ def anchor_targets(sample: Sample, settings: Settings) -> tuple[npt.NDArray[np.i
     )
 
 
-def is_labelled(xy: F64, coverage: str, azimuth: tuple[float, float] | None) -> Bool:
-    """Which places (..., 2) in velo0 the source's own labels reach (contract: `label_coverage`, `label_azimuth`)."""
-    if coverage == "camera" and azimuth is not None:
-        angle = np.arctan2(xy[..., 1], xy[..., 0])
-        return np.asarray((angle - azimuth[0]) % (2.0 * np.pi) <= azimuth[1] - azimuth[0])
-    return np.full(np.shape(xy)[:-1], coverage == "full")
-
-
 def _voxel_of_points(xyz: F32, grid: GridConfig) -> tuple[I64, I64]:
     """Rows of the points in the grid, and their voxels, numbered (ix * Y + iy) * Z + iz."""
     inside = np.ones(len(xyz), dtype=bool)
@@ -251,18 +244,6 @@ def _voxel_of_points(xyz: F32, grid: GridConfig) -> tuple[I64, I64]:
     rows = np.flatnonzero(inside)
     ix, iy, iz = (cell[rows].astype(np.int64) for cell in cells)
     return rows, (ix * grid.shape[1] + iy) * grid.shape[2] + iz
-
-
-def _planar(motion: F64) -> F64:
-    """t_x, t_y, theta of a motion (4, 4): its part in the ground plane."""
-    return np.array([motion[0, 3], motion[1, 3], np.arctan2(motion[1, 0], motion[0, 0])])
-
-
-def _about(planar: F64, centres: F64) -> F64:
-    """Planar motions (C, 3) about the scanner, as motions about `centres` (C, 2): t_L = (R - I) o + t_W."""
-    c, s = np.cos(planar[:, 2]), np.sin(planar[:, 2])
-    x, y = centres.T
-    return np.stack([(c - 1.0) * x - s * y + planar[:, 0], s * x + (c - 1.0) * y + planar[:, 1], planar[:, 2]], axis=1)
 
 
 def _joined(scans: Sequence[Voxels]) -> Voxels:
