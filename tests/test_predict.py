@@ -13,11 +13,19 @@ from training import predict as module
 from training.detection import anchors, encode
 from training.network import Output
 from training.point_files import Points
-from training.predict import UNSURE, Predictor, limits_of, predict_files, predict_pairs, sample_of_scans
+from training.predict import (
+    UNSURE,
+    Predictor,
+    limits_of,
+    points_in_boxes,
+    predict_files,
+    predict_pairs,
+    sample_of_scans,
+)
 from training.rigid_motion import world_to_local
 from training.sample import sample_of
 from training.team import Team
-from training.voxelize import column_centres, column_of_points
+from training.voxelize import FEWEST_POINTS, column_centres, column_of_points
 
 TEAM = Team(0, 1, torch.device("cpu"), False)
 EGO = np.array([-1.0, 0.1, 0.02])
@@ -87,14 +95,22 @@ def test_motions_of_boxes_and_ego_motion_are_matrices_in_the_scanners_frames(pai
 
 
 def test_unsure_boxes_are_kept_for_average_precision_but_move_nothing(pair):
-    sure, unsure = np.array([25.0, 8, -1, 4, 2, 1.5, 0]), np.array([10.0, 0, -1, 4, 2, 1.5, 0])
-    none = np.array([20.0, -8, -1, 4, 2, 1.5, 0])
+    unsure, none = np.array([10.0, 0, -1, 4, 2, 1.5, 0]), np.array([20.0, -8, -1, 4, 2, 1.5, 0])
     logit = np.log(UNSURE) - 0.1
-    one = Predictor(Oracle([sure, unsure, none], [2.0, -1.0, logit]), SETTINGS, TEAM)(pair)
-    np.testing.assert_allclose(one.boxes[:, :2], [[25, 8], [10, 0]], atol=1e-5)
-    assert one.scores[1] < SETTINGS.detection.score
+    one = Predictor(Oracle([unsure, none], [-1.0, logit]), SETTINGS, TEAM)(pair)
+    np.testing.assert_allclose(one.boxes[:, :2], [[10, 0]], atol=1e-5)
+    assert one.scores[0] < SETTINGS.detection.score
     xyz = pair.scan0.xyz[one.where].astype(np.float64)
     np.testing.assert_allclose(one.flows["object"][one.where], planar_flow(EGO, xyz), atol=1e-4)
+
+
+def test_a_box_that_holds_hardly_a_point_is_no_car_however_sure(pair):
+    empty, held = np.array([25.0, 8, -1, 4, 2, 1.5, 0]), np.array([10.0, 0, -1, 4, 2, 1.5, 0])
+    one = Predictor(Oracle([empty, held], [5.0, 1.0]), SETTINGS, TEAM)(pair)
+    np.testing.assert_allclose(one.boxes, held[None], atol=1e-5)
+    counts = points_in_boxes(pair.scan0.xyz, np.stack([empty, held]))
+    assert counts[0] == 0
+    assert counts[1] >= FEWEST_POINTS
 
 
 def test_of_boxes_that_overlap_the_surer_stays(pair):

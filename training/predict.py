@@ -16,7 +16,7 @@ from scipy.special import expit
 
 from augkitti.errors import InputError, MachineError
 from augkitti.frames import F32, F64
-from augkitti.scan_pair import AugmentedPair, Bool
+from augkitti.scan_pair import I64, AugmentedPair, Bool
 from augkitti.shards import replace_whole
 from training import detection
 from training.baselines import rigid_flow
@@ -30,7 +30,7 @@ from training.predictions import Prediction
 from training.rigid_motion import flow_of, local_to_world, matrix_of, pool_over_boxes
 from training.sample import Sample, sample_of
 from training.team import Precision, Team, team_of
-from training.voxelize import Batch, column_centres, column_of_points, empty_share, make_batch
+from training.voxelize import FEWEST_POINTS, Batch, column_centres, column_of_points, empty_share, make_batch
 
 UNSURE = 0.02  # detections above it are kept for average precision; those that are told have settings.detection.score
 
@@ -99,6 +99,8 @@ def _prediction(sample: Sample, part: dict[str, Any], settings: Settings) -> Pre
 
     ego = part["ego"].astype(np.float64)
     boxes, scores = _detections(part["scores"], part["residuals"], settings)
+    held = points_in_boxes(xyz[where], boxes) >= FEWEST_POINTS  # with fewer it is no example in training, either
+    boxes, scores = boxes[held], scores[held]
     world = local_to_world(motion, centres)
     motions = pool_over_boxes(world, centres, boxes, otherwise=ego)
     direct, dense = np.zeros_like(xyz), np.zeros_like(xyz)
@@ -131,6 +133,16 @@ def _detections(logits: F32, residuals: F32, settings: Settings) -> tuple[F64, F
     unsure = settings.detection.model_copy(update={"score": UNSURE})
     kept = detection.nms(boxes, scores[likely], settings.model_copy(update={"detection": unsure}))
     return boxes[kept], scores[likely][kept]
+
+
+def points_in_boxes(xyz: F32, boxes: F64) -> I64:
+    """How many of the points (N, 3) each box (n, 7) holds."""
+    counts = np.zeros(len(boxes), dtype=np.int64)
+    for k, box in enumerate(boxes):
+        reach = np.hypot(box[3], box[4]) / 2
+        near = xyz[(np.abs(xyz[:, 0] - box[0]) <= reach) & (np.abs(xyz[:, 2] - box[2]) <= box[5] / 2)]
+        counts[k] = in_boxes_bev(near.astype(np.float64), boxes[k : k + 1]).sum()
+    return counts
 
 
 def _object_flow(xyz: F32, where: Bool, ego: F64, boxes: F64, scores: F64, motions: F64, least: float) -> F32:
