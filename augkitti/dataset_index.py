@@ -64,6 +64,12 @@ class DatasetIndex:
         """Number of pairs."""
         return sum(shard.rows for shard in self.shards)
 
+    @property
+    def asked(self) -> int:
+        """Number of pairs that were asked for; `totals.pairs_short` of them could not be made."""
+        short = self.totals.get("pairs_short", 0)
+        return self.rows + (short if isinstance(short, int) else 0)
+
 
 def make_index(
     config: Config,

@@ -21,6 +21,7 @@ from augkitti.scan_pair import LabelledBox
 BoxesByFrame = dict[int, tuple[LabelledBox, ...]]
 
 _OUTSIDE_IMAGE = ("2", "3")  # tracklet `truncation`: outside the image, behind it; such poses are extrapolated
+_LARGEST_RAD = 1e6  # sines are worked out of angles up to here
 _FETCH = "fetch it again, or take it away to go on without labels"
 
 
@@ -109,6 +110,8 @@ def _camera_box(category: str, words: list[str], T_velo_cam: F64, where: str) ->
         raise InputError(where, "not a label row: seven numbers of a 3D box expected", _FETCH) from err
     if not all(map(math.isfinite, (height, width, length, x, y, z, rotation_y))):
         raise InputError(where, "a number of the 3D box is not finite", _FETCH)
+    if abs(rotation_y) > _LARGEST_RAD:
+        raise InputError(where, "rotation_y of the 3D box is no angle", _FETCH)
     if min(height, width, length) <= 0.0:
         return None  # labelled in the image only
     centre = transform_points(T_velo_cam, np.array([x, y - height / 2.0, z]))

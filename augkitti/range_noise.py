@@ -9,6 +9,7 @@ fitting them is `pipelines.fit_noise`. What reaches shards goes through `same_ma
 
 import io
 import json
+import tokenize
 import zipfile
 import zlib
 from dataclasses import dataclass, fields
@@ -35,7 +36,7 @@ CORE = 3  # components of the mixture on the surface itself; those after it are 
 
 _FORMAT = 1
 _SIMULATED = ("shot_m", "parametric.shape", "surface", "edge", "edge.car", "edge.share")
-_DAMAGED = (zipfile.BadZipFile, zlib.error)
+_DAMAGED = (zipfile.BadZipFile, zlib.error, tokenize.TokenError, SyntaxError, RuntimeError, AttributeError, TypeError)
 _RETURN_FEATURES, _RAY_FEATURES = 12, 30  # columns of `return_features`, `ray_features`
 _LN_SQRT_2PI = 0.9189385332046727
 _BRIGHT = 0.97  # reflectance: signs, plates

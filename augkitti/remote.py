@@ -13,6 +13,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from fnmatch import fnmatchcase
@@ -22,6 +23,7 @@ from types import SimpleNamespace
 from typing import Any, BinaryIO, cast
 
 from augkitti.errors import InputError, MachineError
+from augkitti.kept_folder import is_whole, put_folder
 
 ATTEMPTS = 10  # of a request that the store answers with an error of its own (500, 503), with growing pauses
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]*)://(.+)")
@@ -249,6 +251,8 @@ def remove_all(folder: Path) -> None:
 def copy_here(folder: Path, cache: Path) -> Path:
     """A folder as it is, or on a store, a copy of it in the cache; another copy once what it holds has changed.
 
+    A copy that was damaged since (`kept_folder.is_whole`) is made again.
+
     Raises:
         FileNotFoundError: there is no such folder.
         MachineError: the store or the disk gives way.
@@ -261,23 +265,23 @@ def copy_here(folder: Path, cache: Path) -> Path:
         raise FileNotFoundError(2, "does not exist", str(folder))
     told = [f"{path} {status.st_size} {status.st_mtime_ns}" for path, status in files]
     target = cache / hashlib.sha256("\n".join(told).encode()).hexdigest()[:32]
-    if target.is_dir():
+    if is_whole(target):
+        with suppress(OSError):
+            os.utime(target)  # used now: the last to go
         return target
     try:
         cache.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=".part-", dir=cache))
-        for path, _ in files:
-            local = part / path.relative_to(source)
-            if not local.resolve().is_relative_to(part.resolve()):
-                raise InputError(str(path), "leads out of its folder", "rename it")
-            local.parent.mkdir(parents=True, exist_ok=True)
-            local.write_bytes(path.read_bytes())
         try:
-            os.rename(part, target)
-        except OSError:
+            for path, _ in files:
+                local = part / path.relative_to(source)
+                if not local.resolve().is_relative_to(part.resolve()):
+                    raise InputError(str(path), "leads out of its folder", "rename it")
+                local.parent.mkdir(parents=True, exist_ok=True)
+                local.write_bytes(path.read_bytes())
+            put_folder(part, target)
+        finally:
             shutil.rmtree(part, ignore_errors=True)
-            if not target.is_dir():  # else another process was faster
-                raise
     except OSError as err:
         problem = f"the cache cannot be written ({err.strerror or err})"
         raise MachineError(cache, problem, "make room or set AUGKITTI_CACHE") from err

@@ -1,9 +1,10 @@
 """The same bytes however a run goes: real scans in, a line with a digest for each way of making one set out.
 
 `python benchmarks/trust.py [../shared/kitti] [../shared/cad] [seed]`: a plain run; `--jobs 2`; three runs killed with
-their whole process group (`kill -9`) at drawn moments and continued with `--resume`, with one and with two processes;
-runs without numpy's processor-specific paths, with another BLAS kernel, and with a C library that sees an old processor
-(each with a cache of its own). Exit code 1 if any digest differs.
+their whole process group (`kill -9`) at drawn moments after a drawn number of finished shards, and continued with
+`--resume`, with one and with two processes; runs without numpy's processor-specific paths, with another BLAS kernel,
+and with a C library that sees an old processor (each with a cache of its own). Exit code 1 if any digest differs, or if
+a run was over before it could be killed.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ import numpy as np
 import numpy._core._multiarray_umath as built
 
 N = 16
+LATER_S = 0.1  # the longest wait between the last shard that is waited for and the kill
 
 
 def main(kitti: str = "../shared/kitti", cad: str = "../shared/cad", seed: str = "0") -> int:
@@ -42,30 +44,34 @@ def main(kitti: str = "../shared/kitti", cad: str = "../shared/cad", seed: str =
         digest, files = digest_of(folder / name)
         found.append(digest if code == 0 else f"exit code {code}")
         print(f"| {how} | {files} | {found[-1][:16]} | {'same' if found[-1] == found[0] else 'DIFFERS'} |", flush=True)
-        shutil.rmtree(folder / name, ignore_errors=True)
+        if name != "cold":  # its shards are counted first
+            shutil.rmtree(folder / name, ignore_errors=True)
 
     print("| run | files | sha256 over all files | |\n| --- | --- | --- | --- |")
     try:
-        began = time.monotonic()
         told("cold", "one process, empty cache", start("cold").wait())
-        cold = time.monotonic() - began
-        began = time.monotonic()
+        shards = len(list((folder / "cold" / "data").glob("*.parquet")))
+        shutil.rmtree(folder / "cold")
         told("two", "two processes, prepared", start("two", "--jobs", "2").wait())
-        warm = time.monotonic() - began
-        for k, share in enumerate(rng.uniform(0.1, 0.9, 3)):
-            jobs = ("1", "2", "2")[k]
+        for k, jobs in enumerate(("1", "2", "2")):
             place = {"AUGKITTI_CACHE": str(folder / "cache-0")} if k == 0 else {}  # the first also prepares
+            rows = folder / f"kill{k}" / ".augkitti-work" / "rows"
+            wanted, wait = int(rng.integers(1, max(2, shards - 2))), float(rng.uniform(0.0, LATER_S))
+            began = time.monotonic()
             process = start(f"kill{k}", "--jobs", jobs, **place)
-            wait = share * (cold if k == 0 else warm)
+            while process.poll() is None and len(list(rows.glob("*.json"))) < wanted:
+                time.sleep(0.002)
             time.sleep(wait)
-            over = process.poll() is not None
-            if not over:
+            killed = process.poll() is None
+            after = time.monotonic() - began
+            if killed:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-            done = len(list((folder / f"kill{k}" / "data").glob("*.parquet")))
-            how = f"--jobs {jobs}, killed after {wait:.1f} s with {done} shards finished, resumed"
-            if over:
-                how = f"--jobs {jobs}, was over before it could be killed"
+            done = len(list(rows.glob("*.json")))
+            how = f"--jobs {jobs}, killed after {after:.1f} s with {done} of {shards} shards finished, resumed"
+            if not killed or not 0 < done < shards:
+                how = f"--jobs {jobs}, NOT KILLED IN ITS MIDDLE: {done} of {shards} shards were finished"
+                found.append(how)
             told(f"kill{k}", how, start(f"kill{k}", "--resume", "--jobs", jobs, **place).wait())
         paths = [name for name in built.__cpu_dispatch__ if built.__cpu_features__[name]]
         for how, more in (

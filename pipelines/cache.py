@@ -2,8 +2,8 @@
 
 `CACHE/prepared/<2 digits>/<digest>.arrays` is what `prepare` finds in scans and pairs, `CACHE/cad/car-<digest>.npz` are
 finished car models, `CACHE/cad-copies/<digest>/` models from a store, `CACHE/streets/<digest>/` embedded streets. A
-name is the digest of all that the content depends on, the program's own source among it: what is found is never stale.
-Nothing is lost but time with any of it.
+name is the digest of all that the content depends on, the program's own source and the libraries that compute it among
+it: what is found is never stale. Nothing is lost but time with any of it.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ import zlib
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,8 @@ _LEFT_OVER = (
     "cad-copies/.part-*",
     "streets/.*.part-*",
 )  # of runs that died
+_PREPARING = ("numpy", "scipy", "small_gicp")  # libraries whose results the cache keeps
+_MAKING = (*_PREPARING, "embreex", "pyarrow", "trimesh")  # those that a shard's bytes depend on
 _STREETS_STAY_S = _LEFT_OVER_STAYS_S = 86_400.0  # streets are a run's source: not taken from under one
 
 
@@ -81,17 +83,35 @@ def bound_bytes() -> float:
 
 @cache
 def program_digest() -> str:
-    """sha256 over the library's own source: another program never reads this one's cache."""
+    """sha256 over all of the program that shards depend on: what `--resume` and the workers of a scheduler compare."""
+    sources = [*_sources("augkitti"), *_sources("pipelines")]
+    return _digest(sources, _MAKING)
+
+
+@cache
+def preparing_digest() -> str:
+    """sha256 over the part of it that prepared scans depend on: another program never reads this one's cache."""
+    sources = [*_sources("augkitti"), *_sources("pipelines", "prepare.py")]
+    return _digest(sources, _PREPARING)
+
+
+def _sources(package: str, ending: str = ".py") -> list[tuple[str, bytes]]:
+    found = [entry for entry in resources.files(package).iterdir() if entry.name.endswith(ending)]
+    return sorted((f"{package}/{entry.name}", entry.read_bytes()) for entry in found)
+
+
+def _digest(sources: list[tuple[str, bytes]], libraries: tuple[str, ...]) -> str:
     digest = hashlib.sha256()
-    for entry in sorted(resources.files("augkitti").iterdir(), key=lambda entry: entry.name):
-        if entry.name.endswith(".py"):
-            digest.update(entry.name.encode() + entry.read_bytes())
+    for name, content in sources:
+        digest.update(f"{name} {len(content)}\n".encode() + content)
+    for name in libraries:
+        digest.update(f"{name} {metadata.version(name)}\n".encode())
     return digest.hexdigest()
 
 
 def entry_path(folder: Path, parts: list[Any]) -> Path:
     """Where what depends on `parts` (JSON) and the program is kept."""
-    key = hashlib.sha256(json.dumps([_FORMAT, program_digest(), *parts], sort_keys=True).encode()).hexdigest()
+    key = hashlib.sha256(json.dumps([_FORMAT, preparing_digest(), *parts], sort_keys=True).encode()).hexdigest()
     return folder / "prepared" / key[:2] / f"{key}.arrays"
 
 

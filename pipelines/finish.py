@@ -35,6 +35,9 @@ def finish_set(run: Run, rows: Sequence[ShardRow]) -> None:
         totals.update(row.totals)
     for entry in (*run.left_out, *(entry for row in rows for entry in row.skipped)):
         skipped[entry["source"], entry["reason"]] += entry["count"]
+    short = options.n - sum(row.pairs for row in rows)
+    if short:  # so that --resume knows how many were asked for
+        totals["pairs_short"] = short
     streets = options.streets
     index = make_index(
         config=options.config,
@@ -50,7 +53,7 @@ def finish_set(run: Run, rows: Sequence[ShardRow]) -> None:
         for path in sorted((options.out / DATA_NAME).iterdir()):
             if path not in known:
                 path.unlink()
-        (options.out / SPLITS_NAME).unlink(missing_ok=True)  # of an earlier, smaller set
+        (options.out / SPLITS_NAME).unlink(missing_ok=True)  # of a set that lost shards
         write_card(options.out, index)
         write_index(options.out, index)
     except OSError as err:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rich.table import Table
 
+from augkitti.dataset_index import INDEX_NAME
 from augkitti.errors import InputError
 from pipelines.augment import augment_all
 from pipelines.finish import finish_set
@@ -24,7 +25,7 @@ from pipelines.run import (
     Run,
     check_output,
     check_work,
-    is_finished,
+    finished_index,
     load_library,
     open_run,
     reopen_run,
@@ -63,9 +64,8 @@ def generate(options: Options, jobs: int, resume: bool, dry_run: bool, scheduler
     if scheduler is not None:
         check_scheduler(scheduler)
     run = _begin(options, jobs, resume)
-    if resume and is_finished(run):
-        print(f"{options.out} is finished and whole: nothing to do")
-        return 0
+    if resume and (made := _already_made(run)) is not None:
+        return _shortfall(made, options.n, f"`skipped` in {INDEX_NAME} says why")
     with hold(options.work):
         if scheduler is None:
             _prepare(run, jobs, resume)
@@ -82,8 +82,19 @@ def prepare_stage(options: Options, jobs: int, resume: bool) -> None:
         InputError: as `generate`.
     """
     run = _begin(options, jobs, resume)
+    if resume and _already_made(run) is not None:
+        return
     with hold(options.work):
         _prepare(run, jobs, resume)
+
+
+def _already_made(run: Run) -> int | None:
+    """How many pairs the run's finished and whole data set has, which is told; None if there is something to do."""
+    index = finished_index(run)
+    if index is None:
+        return None
+    print(f"{run.options.out} is finished and whole: nothing to do")
+    return index.rows
 
 
 def _begin(options: Options, jobs: int, resume: bool) -> Run:
@@ -168,10 +179,14 @@ def _close(run: Run, rows: list[ShardRow], seconds: float | None) -> int:
     finish_set(run, rows)
     made = sum(row.pairs for row in rows)
     _print_totals(run, rows, made, seconds)
-    if made < run.options.n:
-        print(f"short by {run.options.n - made} of {run.options.n} pairs: see the reasons above", file=sys.stderr)
-        return 1
-    return 0
+    return _shortfall(made, run.options.n, "see the reasons above")
+
+
+def _shortfall(made: int, n: int, why: str) -> int:
+    """The exit code of a finished set; says what is wanting."""
+    if made < n:
+        print(f"short by {n - made} of {n} pairs: {why}", file=sys.stderr)
+    return int(made < n)
 
 
 def _first_line(options: Options) -> str:

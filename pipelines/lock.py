@@ -37,7 +37,8 @@ def hold(work: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            path.unlink(missing_ok=True)
+            if _object(path) == _own():
+                path.unlink(missing_ok=True)
         return
     try:
         work.mkdir(parents=True, exist_ok=True)
@@ -97,31 +98,47 @@ def _locked(path: Path, create: bool = True) -> int:
 
 
 def _take(path: Path) -> None:
-    """Put a lock on a store that has none; of two runs that try at once, a store that can tell lets one.
+    """Put a lock on a store that has none, or a dead run's; of two that try at once, a store that can tell lets one.
+
+    Nothing is taken away but the lock of a dead run, and what stands there in the end has to be our own.
 
     Raises:
         InputError: another run holds it.
     """
-    _check_object(path)
-    path.unlink(missing_ok=True)
-    try:
+    if _check_object(path) is not None:
+        path.unlink(missing_ok=True)
+    with suppress(FileExistsError):  # another run was faster: told below
         put_whole(path, lambda file: file.write(json.dumps(_own()).encode()), new=True)
-    except FileExistsError:
-        _check_object(path)
+    found = _object(path)
+    if found != _own():
+        raise _held_object(path, found or {})
 
 
-def _check_object(path: Path) -> None:
-    """Refuse a lock on a store whose run lives, or may live on another host.
+def _check_object(path: Path) -> dict[str, Any] | None:
+    """Refuse a lock on a store whose run lives, or may live on another host; a dead run's lock, None without one.
 
     Raises:
         InputError: as said.
     """
+    content = _object(path)
+    if content and _lives(content):
+        raise _held_object(path, content)
+    return content
+
+
+def _object(path: Path) -> dict[str, Any] | None:
+    """What a lock on a store says, nothing where it is damaged; None where there is none."""
     try:
         content = json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError):
-        return
-    if isinstance(content, dict) and _lives(content):
-        raise _held(path, content, f"; if it is dead, remove {path}")
+    except FileNotFoundError:
+        return None
+    except (ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _held_object(path: Path, content: dict[str, Any]) -> InputError:
+    return _held(path, content, f"; if it is dead, remove {path}")
 
 
 def _held(path: Path, content: dict[str, Any], more: str = "") -> InputError:
@@ -151,5 +168,5 @@ def _content(file: int) -> dict[str, Any]:
     try:
         content = json.loads(os.pread(file, 4096, 0))
         return content if isinstance(content, dict) else {}
-    except ValueError:
+    except (ValueError, RecursionError):
         return {}

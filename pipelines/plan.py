@@ -31,7 +31,7 @@ import numpy.typing as npt
 from augkitti.errors import InputError
 from augkitti.seeds import generator, pair_seed
 
-POOL_PAIRS = 32  # a shard of 32 pairs is about 130 MB: large enough to read fast, small enough to lose
+POOL_PAIRS = 32  # a shard of 32 pairs is about 96 MB: large enough to read fast, small enough to lose
 SPARE_PASSES = 4  # how often a pool is gone through again for spares
 SPARE_VARIANT = 1_000_000  # variants from here on are spares
 

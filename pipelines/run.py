@@ -265,15 +265,17 @@ def check_output(out: Path, resume: bool) -> None:
         raise InputError(out, f"cannot be written ({err.strerror})", "take another --out, or mend permissions") from err
 
 
-def is_finished(run: Run) -> bool:
-    """Whether the output folder holds the run's data set, finished and whole; takes a broken one's index away.
+def finished_index(run: Run) -> DatasetIndex | None:
+    """The index of the run's data set if the output folder holds it, finished and whole; takes a broken one's away.
+
+    A set that fell short of its `--n` is finished, too.
 
     Raises:
         InputError: it holds a finished data set made otherwise; names what differs.
     """
     out, options = run.options.out, run.options
     if (options.work / _STATE).is_file() or not (out / INDEX_NAME).is_file():
-        return False
+        return None
     index = read_index(out)
     wanted = shard_metadata(options.config, options.scanner, options.models)
     readable = [shard for shard in index.shards if (out / shard.path).is_file()]
@@ -288,19 +290,19 @@ def is_finished(run: Run) -> bool:
     if index.seed != options.seed:
         differs.append("seed")
     names = {f"{DATA_NAME}/{shard.name}.parquet" for shard in run.shards}
-    if not {shard.path for shard in index.shards} <= names or index.rows > options.n:
-        differs.append("source or --n")
+    if index.asked == options.n and not {shard.path for shard in index.shards} <= names:
+        differs.append("source")
     if differs:
         raise InputError(out, f"was made with another {', '.join(differs)}", "resume with the same, or start anew")
-    short = options.n - index.rows
-    if short == 0 and all(
-        shard in readable and file_sha256(out / shard.path) == shard.sha256 for shard in index.shards
-    ):
+    if index.asked != options.n:  # its shards hold other numbers of pairs: all would have to be made again
+        remedy = f"take another --out (a larger set holds the pairs of a smaller one), or --n {index.asked}"
+        raise InputError(out, f"was finished with --n {index.asked}", remedy)
+    if all(shard in readable and file_sha256(out / shard.path) == shard.sha256 for shard in index.shards):
         end_work(out)  # a run may have died just before
-        return True
+        return index
     for name in (INDEX_NAME, SPLITS_NAME, CARD_NAME):
         (out / name).unlink(missing_ok=True)
-    return False
+    return None
 
 
 def start_work(run: Run, resume: bool) -> None:
@@ -351,8 +353,8 @@ def reopen_run(out: Path) -> Run:
     settings = content["options"]
     try:
         options = Options(
-            kitti=None if settings["kitti"] is None else as_path(settings["kitti"]),
-            cad=None if settings["cad"] is None else as_path(settings["cad"]),
+            kitti=_place(settings["kitti"]),
+            cad=_place(settings["cad"]),
             out=out,
             n=int(settings["n"]),
             seed=int(settings["seed"]),
@@ -361,11 +363,28 @@ def reopen_run(out: Path) -> Run:
             stop_on_error=bool(settings["stop_on_error"]),
             cache=Path(settings["cache"]),
         )
+        if options.seed < 0:
+            raise ValueError("seed")
     except (KeyError, TypeError, ValueError) as err:
         raise InputError(state, "is no run of this program", "begin again in another folder") from err
-    run = open_run(options)
+    try:
+        run = open_run(options)
+    except OSError as err:  # such as a name that no file can have
+        problem = f"names a source that cannot be read ({err.strerror})"
+        raise InputError(state, problem, "see that it is there, or begin again in another folder") from err
     start_work(run, resume=True)
     return run
+
+
+def _place(given: Any) -> Path | None:
+    """A folder as `run.json` names it.
+
+    Raises:
+        TypeError: it names none.
+    """
+    if given is not None and not isinstance(given, str):
+        raise TypeError(f"{given!r} is no folder")
+    return None if given is None else as_path(given)
 
 
 def check_work(out: Path) -> None:
@@ -415,7 +434,7 @@ def _read_state(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(content["options"], dict) and isinstance(content["identity"], dict):
             return dict(content)
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         pass
     raise InputError(path, "is no run of this program", "begin again in another folder")
 

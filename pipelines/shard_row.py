@@ -37,7 +37,7 @@ def read_row(work: Path, out: Path, shard: ShardPlan) -> ShardRow | None:
         row = ShardRow(ShardPlan(**content["shard"]), entry, dict(content["totals"]), tuple(content["skipped"]))
         if row.shard != shard or (entry is not None and file_sha256(out / entry.path) != entry.sha256):
             return None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return row
 

@@ -139,7 +139,8 @@ def _on_worker(task: Callable[[Item], Result], item: Item, weight: int, main: st
 
     worker = get_worker()
     if program_digest() != main:
-        raise MachineError(worker.address, "has another version of augkitti", "install the same on every worker")
+        problem = "has another version of augkitti, or of a library under it"
+        raise MachineError(worker.address, problem, "install the same on every worker (constraints.txt)")
     if worker.state.nthreads != 1:
         raise MachineError(worker.address, "runs several tasks at once", "start workers with --nthreads 1")
     return task(item), weight

@@ -4,12 +4,16 @@ A street is a short drive of its own, so that even a few pairs come from differe
 same however many there are.
 """
 
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from augkitti.errors import InputError
+from augkitti.kept_folder import is_whole, put_folder
 from augkitti.scanner import ScannerProfile
 
 PAIRS_PER_STREET = 5  # the most; half of what would do, for a split of 20 pairs by recording needs three streets
@@ -27,8 +31,8 @@ class Streets:
 
     @property
     def are_there(self) -> bool:
-        """Whether they have been made."""
-        return self.folder.is_dir()
+        """Whether they have been made, and no file was lost, cut or written over since."""
+        return is_whole(self.folder)
 
     def as_source(self) -> dict[str, Any]:
         """What `dataset.json` says of them: enough to make them again."""
@@ -73,17 +77,21 @@ def make_streets(streets: Streets, profile: ScannerProfile, jobs: int) -> None:
         InputError: the cache cannot be written.
     """
     if streets.are_there:
+        with suppress(OSError):  # a cache that may only be read serves as well
+            os.utime(streets.folder)  # used now: not taken from under the run
         return
     from augkitti.synthesize import synthesize
 
+    above = streets.folder.parent
     try:
-        streets.folder.parent.mkdir(parents=True, exist_ok=True)
-        synthesize(streets.folder, streets.drives, streets.frames, streets.seed, profile, jobs)
+        above.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=f".{streets.folder.name}.part-", dir=above) as part:
+            synthesize(Path(part) / "made", streets.drives, streets.frames, streets.seed, profile, jobs)
+            put_folder(Path(part) / "made", streets.folder)
     except OSError as err:
         raise InputError(streets.folder, f"cannot be written ({err.strerror})", "set AUGKITTI_CACHE") from err
-    except InputError:
-        if not streets.are_there:  # else another run was faster
-            raise
+    except InputError as err:
+        raise InputError(streets.folder, err.problem, "make room, or set AUGKITTI_CACHE") from err
 
 
 def _streets(drives: int, frames: int, seed: int, profile: ScannerProfile, cache: Path) -> Streets:

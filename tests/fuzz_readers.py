@@ -21,6 +21,7 @@ import tempfile
 import time
 import traceback
 import warnings
+import zipfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -398,6 +399,62 @@ def _read_profile(folder: Path) -> None:
     assert len(profile.digest) == 64
 
 
+def _noise(folder: Path) -> list[Path]:
+    from augkitti.range_noise import load_noise, save_noise
+
+    save_noise(load_noise(), folder / "noise.npz")
+    return [folder / "noise.npz"]
+
+
+def _read_noise(folder: Path) -> None:
+    from augkitti.range_noise import load_noise, solid_part
+
+    profile = load_noise(folder)
+    _finite(*profile.arrays.values())
+    solid_part(profile)
+
+
+def _prepared(folder: Path) -> list[Path]:
+    from augkitti.config import Config
+    from augkitti.scanner import load_profile
+    from pipelines.prepare import prepared_pair
+
+    _drive(folder)
+    prepared_pair(_sequence(folder), 0, load_profile(), Config(), folder)
+    files = sorted((folder / "prepared").rglob("*.arrays"))
+    for path in files:
+        path.with_suffix(".kept").write_bytes(path.read_bytes())
+    return files
+
+
+def _read_prepared(folder: Path) -> None:
+    from pipelines.cache import load
+
+    for path in sorted((folder / "prepared").rglob("*.arrays")):
+        whole, found = path.with_suffix(".kept").read_bytes(), load(path)
+        assert found is None or path.read_bytes() == whole, "a damaged cache file was believed"
+        assert found is not None or path.read_bytes() != whole, "a whole cache file was not"
+
+
+def _run_state(folder: Path) -> list[Path]:
+    from pipelines.run import WORK, open_run, read_options, start_work
+
+    _drive(folder / "kitti")
+    given = {"cad": None, "seed": 0, "config": None, "profile": None, "stop_on_error": False}
+    start_work(open_run(read_options(kitti=folder / "kitti", out=folder / "out", n=2, **given)), resume=False)
+    return [folder / "out" / WORK / "run.json"]
+
+
+def _read_run_state(folder: Path) -> None:
+    from augkitti.errors import InputError, MachineError
+    from pipelines.run import reopen_run
+
+    try:
+        reopen_run(folder / "out")
+    except MachineError as err:  # an address that a word made of a path: its store gives no answer
+        raise InputError(err.where, err.problem, err.remedy) from None
+
+
 def _source_sidecar(folder: Path) -> list[Path]:
     return _drive(folder, f"{DAY}/{DRIVE}/augkitti_source.json", f"{DAY}/{DRIVE}/velo_poses.txt", truth=True)
 
@@ -517,6 +574,9 @@ FORMATS = (
     Format("car cache", _car_cache, _read_car_cache, kind="bytes"),
     Format("configuration YAML", _config, _read_config, kind="yaml"),
     Format("scanner profile JSON", _profile, _read_profile, kind="json"),
+    Format("noise profile .npz", _noise, _read_noise, kind="bytes"),
+    Format("prepared .arrays", _prepared, _read_prepared, kind="bytes"),
+    Format("run.json", _run_state, _read_run_state, kind="json"),
     Format("shard", _data_set, _read_shard, kind="bytes"),
     Format("dataset.json", _index, _read_index, kind="json"),
     Format("splits.json", _splits, _read_index, kind="json"),
@@ -823,6 +883,16 @@ HARMS = {
 }
 
 
+def _harm_archive(path: Path, rng: random.Random) -> None:
+    """An archive that is a good one, of which one file is harmed."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = rng.choice(sorted(members))
+    with zipfile.ZipFile(path, "w") as archive:
+        for member, content in members.items():
+            archive.writestr(member, mutated(content, rng, "bytes") if member == name else content)
+
+
 def _harm_shard(path: Path, rng: random.Random) -> None:
     """A shard that is good Parquet, but whose columns, values or metadata are not the contract's."""
     import pyarrow as pa
@@ -886,6 +956,8 @@ class _Bench:
         path = rng.choice(self.files)
         if self.item.name == "shard" and rng.random() < 0.4:
             _harm_shard(path, rng)
+        elif self.item.name == "noise profile .npz" and rng.random() < 0.6:
+            _harm_archive(path, rng)
         else:
             path.write_bytes(mutated(self.kept[path], rng, self.item.kind))
         self._touch(path)

@@ -156,6 +156,28 @@ def test_the_cache_folder_follows_the_environment(monkeypatch, tmp_path):
     assert pipelines.cache.cache_folder() == tmp_path / "b" / "augkitti"
 
 
+def test_the_cache_is_shown_and_cleared(augkitti, tmp_path, monkeypatch):
+    monkeypatch.setenv("AUGKITTI_CACHE_GB", "5")
+    folder = tmp_path / "cache" / "prepared" / "ab"
+    folder.mkdir(parents=True)
+    for name, size in (("one.arrays", 20_000_000), ("notes.txt", 1)):
+        with (folder / name).open("wb") as file:
+            file.truncate(size)
+    shown = augkitti("cache", "info")
+    assert shown.exit_code == 0
+    assert shown.output.splitlines() == [
+        f"{tmp_path / 'cache'}: 0.02 of at most 5.0 GB",
+        *("  prepared: 1, 0.02 GB", "  cad: 0, 0.00 GB", "  cad-copies: 0, 0.00 GB", "  streets: 0, 0.00 GB"),
+    ]
+    cleared = augkitti("cache", "clear")
+    assert (cleared.exit_code, cleared.output) == (0, "1 entries removed, 0.02 GB\n")
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    monkeypatch.setenv("AUGKITTI_CACHE_GB", "much")
+    refused = augkitti("cache", "info")
+    assert refused.exit_code == 2
+    assert refused.stderr.startswith("augkitti: AUGKITTI_CACHE_GB: ")
+
+
 def test_the_embedded_default_is_generated_and_checked_against_the_streets_in_the_cache(augkitti, tmp_path):
     result = augkitti("generate", "--n", 1, "--cars", "1", "--out", "aug")
     assert result.exit_code == 0, result.output + result.stderr

@@ -22,7 +22,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(workers, name):
     outcome = workers.run(name, 0, 100)
     assert not outcome.faults
     assert outcome.read, "the mutations are too coarse to tell anything"
-    assert outcome.refused or name == "car cache"  # a damaged cache file is made again
+    assert outcome.refused or name in ("car cache", "prepared .arrays")  # a damaged cache file is made again
 
 
 def _calls(path: Path):

@@ -96,7 +96,12 @@ def test_tracking_rows_become_velo_boxes_of_the_drives_frames(tmp_path: Path) ->
     np.testing.assert_allclose(car.box, [10.27, -2.0, -0.98, 4.0, 1.6, 1.5, 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize("line", ["0 1", "0 1 Car 0 0 0 1 2 3 4 1 1 1", "x 1 Car", "0 1 Car" + " a" * 14, "0 y Van"])
+NO_ANGLE = "0 1 Car 0 0 0 1 2 3 4 1.5 1.6 4 2 1 10 1e300"
+
+
+@pytest.mark.parametrize(
+    "line", ["0 1", "0 1 Car 0 0 0 1 2 3 4 1 1 1", "x 1 Car", "0 1 Car" + " a" * 14, "0 y Van", NO_ANGLE]
+)
 def test_malformed_tracking_rows_are_one_error_with_the_line(tmp_path: Path, line: str) -> None:
     path = tmp_path / "0003.txt"
     path.write_text("\n" + line + "\n")

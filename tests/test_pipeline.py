@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,39 @@ def test_a_shortfall_is_told_by_the_exit_code(drives, cache, tmp_path, monkeypat
     index = read_index(tmp_path / "aug")
     assert index.rows == 3, "one of a drive's three pairs can be made: once as planned, and as spares"
     assert sum(row["count"] for row in index.skipped) > 3
+
+
+def test_a_set_that_fell_short_is_left_as_it_is_by_resume_and_its_n_is_known(
+    drives, cache, tmp_path, monkeypatch, capsys
+):
+    whole = pipelines.augment.make_pair
+
+    def only_first_frames(sequence, candidate, options):
+        return whole(sequence, candidate, options) if candidate.frame0 == 40 else None
+
+    out = tmp_path / "aug"
+    monkeypatch.setattr(pipelines.augment, "make_pair", only_first_frames)
+    assert generate(options_of(drives, out, cache, n=6, cars=(0, 0)), jobs=1, resume=False, dry_run=False) == 1
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.rglob("*") if path.is_file()}
+    assert read_index(out).totals["pairs_short"] == 3
+    monkeypatch.setattr(pipelines.augment, "make_pair", None)
+    assert generate(options_of(drives, out, cache, n=6, cars=(0, 0)), jobs=1, resume=True, dry_run=False) == 1
+    assert "short by 3 of 6 pairs: `skipped` in dataset.json says why" in capsys.readouterr().err
+    for n in (3, 7):
+        with pytest.raises(InputError, match=r"was finished with --n 6; take another --out .*, or --n 6"):
+            generate(options_of(drives, out, cache, n=n, cars=(0, 0)), jobs=1, resume=True, dry_run=False)
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("n", [4, 6])
+@pytest.mark.parametrize("begin", [partial(generate, dry_run=False), prepare_stage])
+def test_a_finished_set_is_not_made_again_with_another_n(made, drives, cache, n, begin):
+    before = {path: path.stat().st_mtime_ns for path in made.rglob("*")}
+    options = options_of(drives, made, cache, n=n)
+    with pytest.raises(InputError, match=r"was finished with --n 5; take another --out .*, or --n 5"):
+        begin(options, jobs=1, resume=True)
+    prepare_stage(options_of(drives, made, cache, n=5), jobs=1, resume=True)
+    assert {path: path.stat().st_mtime_ns for path in made.rglob("*")} == before
 
 
 def test_rows_with_nan_or_zeros_are_dropped_and_counted(drives, cache, tmp_path):

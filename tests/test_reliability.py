@@ -5,6 +5,7 @@ import os
 import resource
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -13,13 +14,15 @@ from pathlib import Path
 
 import pytest
 from pair_rows import assert_among, rows_of
+from tiny_drive import write_drive
 
+from augkitti.dataset_index import replace_whole
 from augkitti.errors import InputError, MachineError
-from pipelines import cache
+from pipelines import augment, cache
 from pipelines.augment import augment_shard
 from pipelines.generate import generate
 from pipelines.lock import NAME, hold
-from pipelines.run import WORK, Options, open_run, read_options
+from pipelines.run import WORK, Options, end_work, open_run, read_options
 
 N = 6  # pairs, in two streets: two shards
 
@@ -102,6 +105,46 @@ def test_a_process_group_that_a_signal_ends_goes_on_to_the_same_bytes(made, stor
     assert said in told
     assert "Traceback" not in told
     assert not (out / "dataset.json").exists()
+    assert resumed(out, store) == made
+
+
+def test_a_run_killed_after_its_first_shard_keeps_it_and_goes_on_to_the_same_bytes(tmp_path):
+    out, rows = tmp_path / "aug", tmp_path / "aug" / WORK / "rows"
+    for number in ("0001", "0002", "0005", "0009"):  # four shards of two pairs
+        write_drive(tmp_path / "kitti", frames=(0, 1, 2), name=f"2011_09_26_drive_{number}_sync", truth=True)
+    words = ("--kitti", str(tmp_path / "kitti"), "--n", "8")
+    assert run(tmp_path / "undisturbed", tmp_path / "cache", *words) == (0, "")
+    process = subprocess.Popen(
+        **command(out, tmp_path / "cache", *words), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+    )
+    while not list(rows.glob("*.json")):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.002)
+    process.kill()
+    process.communicate()
+    finished = [path.stem for path in rows.glob("*.json")]
+    assert 1 <= len(finished) < 4
+    kept = {path: path.stat().st_mtime_ns for path in (out / "data" / f"{name}.parquet" for name in finished)}
+    assert run(out, tmp_path / "cache", *words, "--resume") == (0, "")
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept, "what was finished is not made again"
+    assert digests(out) == digests(tmp_path / "undisturbed")
+
+
+def test_memory_that_ends_under_a_pair_ends_the_run_and_it_goes_on(made, store, tmp_path, monkeypatch):
+    whole, calls = augment.make_pair, []
+
+    def short(*arguments):
+        calls.append(arguments)
+        if len(calls) == N:  # in the second shard
+            raise MemoryError
+        return whole(*arguments)
+
+    out = tmp_path / "aug"
+    monkeypatch.setattr(augment, "make_pair", short)
+    with pytest.raises(MachineError, match="memory ran out; use fewer --jobs, then go on with --resume"):
+        generate(options_of(out, store), jobs=1, resume=False, dry_run=False)
+    assert len(list((out / WORK / "rows").iterdir())) == 1
+    monkeypatch.undo()
     assert resumed(out, store) == made
 
 
@@ -249,5 +292,98 @@ def test_a_bound_that_is_no_number_is_refused(monkeypatch):
         cache.bound_bytes()
 
 
-def test_the_work_folder_goes_last_of_all(made):
-    assert not [name for name in made if name.startswith(WORK)]
+# --- the order of things ----------------------------------------------------------------------------------------------
+
+
+def test_the_work_folder_goes_when_all_else_is_there(made, store, tmp_path, monkeypatch):
+    def dies(folder):
+        raise KeyboardInterrupt
+
+    out = tmp_path / "aug"
+    monkeypatch.setattr("pipelines.finish.end_work", dies)
+    with pytest.raises(KeyboardInterrupt):
+        generate(options_of(out, store), jobs=1, resume=False, dry_run=False)
+    assert (out / WORK / "run.json").is_file()
+    assert {name: digest for name, digest in digests(out).items() if not name.startswith(WORK)} == made
+    monkeypatch.undo()
+    assert resumed(out, store) == made
+
+
+def test_the_lock_is_the_last_of_the_work_folder_to_go(tmp_path, monkeypatch):
+    work, gone, unlink = tmp_path / WORK, [], Path.unlink
+
+    def noted(path, missing_ok=False):
+        gone.append(path.name)
+        unlink(path, missing_ok)
+
+    (work / "rows").mkdir(parents=True)
+    for name in ("a", NAME, "run.json", "rows/row.json", "z"):
+        (work / name).write_text("")
+    monkeypatch.setattr(Path, "unlink", noted)
+    end_work(tmp_path)
+    assert not work.exists()
+    assert (gone[0], gone[-1]) == ("run.json", NAME)
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name_and_then_its_folder_is(tmp_path, monkeypatch):
+    done, fsync, rename = [], os.fsync, os.replace
+
+    def synced(file):
+        status = os.fstat(file)
+        done.append("folder" if stat.S_ISDIR(status.st_mode) else f"{status.st_size} bytes")
+        fsync(file)
+
+    def renamed(one, other):
+        done.append("rename")
+        rename(one, other)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    replace_whole(tmp_path / "file", lambda file: file.write(b"all"))
+    assert done == ["3 bytes", "rename", "folder"]
+
+
+# --- which program ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def program(monkeypatch):
+    """A function that tells the digests of the program and of what prepares, worked out anew."""
+    both = (cache.program_digest, cache.preparing_digest)
+
+    def told():
+        for digest in both:
+            digest.cache_clear()
+        return tuple(digest() for digest in both)
+
+    yield told
+    monkeypatch.undo()
+    for digest in both:
+        digest.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("library", "prepares"),
+    [("numpy", 1), ("scipy", 1), ("small_gicp", 1), ("embreex", 0), ("pyarrow", 0), ("trimesh", 0)],
+)
+def test_another_version_of_a_library_is_another_program(program, monkeypatch, library, prepares):
+    whole, before, version = program(), cache.entry_path(Path(), ["scan"]), cache.metadata.version
+    monkeypatch.setattr(cache.metadata, "version", lambda name: "0" if name == library else version(name))
+    other = program()
+    assert whole[0] != other[0]
+    assert (whole[1] != other[1]) == (before != cache.entry_path(Path(), ["scan"])) == bool(prepares)
+
+
+@pytest.mark.parametrize(
+    ("source", "prepares"), [("augkitti/ground.py", 1), ("pipelines/prepare.py", 1), ("pipelines/augment.py", 0)]
+)
+def test_a_changed_line_of_library_or_pipelines_is_another_program(program, monkeypatch, source, prepares):
+    whole, sources = program(), cache._sources
+
+    def changed(*arguments):
+        return [(name, text + b"#" * (name == source)) for name, text in sources(*arguments)]
+
+    monkeypatch.setattr(cache, "_sources", changed)
+    other = program()
+    assert whole[0] != other[0]
+    assert (whole[1] != other[1]) == bool(prepares)

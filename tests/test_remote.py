@@ -1,5 +1,6 @@
 """Folders on an object store: an S3 server on loopback, one that fails every tenth request too; the local bytes."""
 
+import json
 import os
 import pickle
 import subprocess
@@ -19,6 +20,7 @@ from augkitti.errors import InputError, MachineError
 from augkitti.kitti import open_root, read_pair
 from augkitti.remote import RemotePath, as_path, as_source, copy_here, is_remote
 from augkitti.shards import replace_whole
+from pipelines import lock
 from pipelines.cli import app
 from pipelines.run import WORK
 
@@ -159,15 +161,62 @@ def test_a_run_that_was_cut_off_goes_on_and_a_finished_one_is_refused(local, buc
 
 
 def test_a_folder_that_a_living_run_holds_is_refused(bucket):
-    from pipelines.lock import hold
-
     work = as_path(f"{BUCKET}/held/{WORK}")
-    with hold(work):
+    with lock.hold(work):
         content = (work / "lock").read_bytes()
     assert not (work / "lock").exists()
     replace_whole(work / "lock", lambda file: file.write(content.replace(b'"host": "', b'"host": "another ')))
-    with pytest.raises(InputError, match=r"is held by another run .*; if it is dead, remove s3://"), hold(work):
+    with pytest.raises(InputError, match=r"is held by another run .*; if it is dead, remove s3://"), lock.hold(work):
         pass
+
+
+RIVAL = {"host": "another", "process": 1, "start": "1"}
+
+
+def put_rival(path):
+    replace_whole(path, lambda file: file.write(json.dumps(RIVAL).encode()))
+
+
+@pytest.mark.parametrize("moment", ["looked", "tried", "asked", "put"])
+def test_of_two_runs_that_take_a_lock_in_one_moment_ours_is_refused_and_theirs_stays(bucket, monkeypatch, moment):
+    """The other run's lock comes after ours found none, before ours puts, in the middle of it, or after it."""
+    work, look, put = as_path(f"{BUCKET}/raced-{moment}/{WORK}"), lock._check_object, lock.put_whole
+
+    def looked(path):
+        found = look(path)
+        if moment == "looked":
+            put_rival(path)
+        return found
+
+    def tried(path, write, new=False):
+        if moment == "tried":
+            put_rival(path)
+        put(path, write, new)
+        if moment == "put":  # on a store without conditional writes
+            put_rival(path)
+
+    def asked(path):
+        put_rival(path)
+        return False
+
+    monkeypatch.setattr(lock, "_check_object", looked)
+    monkeypatch.setattr(lock, "put_whole", tried)
+    if moment == "asked":
+        monkeypatch.setattr(RemotePath, "exists", asked)
+    with pytest.raises(InputError, match=r"held by another run \(process 1 on another\)"), lock.hold(work):
+        pass
+    assert json.loads((work / "lock").read_bytes()) == RIVAL
+
+
+def test_a_dead_runs_lock_on_a_store_is_taken_over_and_a_run_that_ends_takes_its_own_lock_alone(bucket):
+    work = as_path(f"{BUCKET}/dead/{WORK}")
+    own = lock._own()
+    dead = json.dumps(own | {"process": 2**22 + 1}).encode()  # above the largest number that Linux gives
+    replace_whole(work / "lock", lambda file: file.write(dead))
+    with lock.hold(work):
+        assert json.loads((work / "lock").read_bytes()) == own
+        put_rival(work / "lock")
+    assert json.loads((work / "lock").read_bytes()) == RIVAL
 
 
 def test_a_file_is_on_the_store_whole_or_not_at_all(bucket):
@@ -211,13 +260,18 @@ def test_what_is_not_there_is_told_as_on_a_disk(bucket, run):
     assert run("split", "s3://").exit_code == 2
 
 
-def test_car_models_are_copied_once_and_again_when_they_change(bucket, tmp_path):
+def test_car_models_are_copied_once_and_again_when_they_change_or_the_copy_is_damaged(bucket, tmp_path):
     folder = as_path(f"{BUCKET}/cad")
     for name in ("a.obj", "parts/b.mtl"):
         replace_whole(folder / name, lambda file: file.write(b"one"))
     here = copy_here(folder, tmp_path)
     assert (here / "parts" / "b.mtl").read_bytes() == b"one"
     assert copy_here(folder, tmp_path) == here
+    (here / "a.obj").write_bytes(b"on")
+    (here / "parts" / "b.mtl").unlink()
+    assert copy_here(folder, tmp_path) == here
+    assert [(here / name).read_bytes() for name in ("a.obj", "parts/b.mtl")] == [b"one", b"one"]
+    assert [path.name for path in tmp_path.iterdir()] == [here.name]
     replace_whole(folder / "a.obj", lambda file: file.write(b"another"))
     assert (copy_here(folder, tmp_path) / "a.obj").read_bytes() == b"another"
 

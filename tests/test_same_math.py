@@ -86,3 +86,5 @@ def test_no_bit_depends_on_what_numpy_blas_and_the_c_library_find_in_the_process
         for more in ({}, without)
     ]
     assert ran[0][0] == ran[1][0]
+    if ran[0][1] == ran[1][1]:
+        pytest.skip("numpy's own arctangent has the same bits with and without: this processor shows nothing")

@@ -7,13 +7,15 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tiny_drive import write_drive
 
 from augkitti.dataset_index import file_sha256
-from augkitti.errors import InputError
+from augkitti.errors import InputError, MachineError
 from pipelines import stage
+from pipelines.cache import program_digest
 from pipelines.run import WORK
 
 pytest.importorskip("distributed", reason="needs the extra `distributed`")
@@ -111,6 +113,22 @@ def test_a_run_on_two_workers_of_which_one_is_killed_ends_with_the_bytes_of_a_lo
 
 def digests(folder):
     return {str(path.relative_to(folder)): file_sha256(path) for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("program", "threads", "problem"),
+    [("another", 1, "has another version of augkitti, or of a library"), (None, 2, "runs several tasks at once")],
+)
+def test_a_worker_of_another_program_or_of_several_threads_does_no_task(monkeypatch, program, threads, problem):
+    worker = SimpleNamespace(address="tcp://worker:1", state=SimpleNamespace(nthreads=threads))
+    monkeypatch.setattr("distributed.get_worker", lambda: worker)
+    done = []
+    with pytest.raises(MachineError, match=f"tcp://worker:1: {problem}"):
+        stage._on_worker(done.append, 1, 1, program or program_digest())
+    assert not done
+    worker.state.nthreads = 1
+    assert stage._on_worker(done.append, 1, 5, program_digest()) == (None, 5)
+    assert done == [1]
 
 
 def test_a_scheduler_that_is_not_there_is_told_in_one_line(monkeypatch):
