@@ -79,10 +79,18 @@ def made(undisturbed):
     return digests(undisturbed)
 
 
+def _hear_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell starts what runs in the background deaf to them
+
+
 def begun(out: Path, store: Path, *words: str) -> subprocess.Popen:
     """A run of its own process group that has begun to write a shard."""
     process = subprocess.Popen(
-        **command(out, store, *words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        **command(out, store, *words),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=_hear_interrupts,
     )
     for _ in range(3000):
         if list(out.glob("data/.*.tmp")):
