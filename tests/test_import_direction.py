@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FORBIDDEN = {"augkitti": {"training", "pipelines"}, "training": {"pipelines"}, "pipelines": {"training"}}
 HEAVY = {"torch", "open3d", "matplotlib", "distributed"}
 SLOW_TO_START = {"numpy", "scipy", "pyarrow", "trimesh", "joblib", "pydantic", "yaml", "small_gicp", "embreex"}
+CONTRACT = ("dataset", "dataset_index", "errors", "frames", "scan_pair", "seeds", "shards", "splits")
 MODULES = [path for package in FORBIDDEN for path in sorted((ROOT / package).rglob("*.py"))]
 
 
@@ -51,6 +52,14 @@ def test_imports_go_one_way(path):
 )
 def test_no_module_of_the_core_needs_an_extra_to_be_imported(path):
     assert not imported(executed_on_import(ast.parse(path.read_text()))) & HEAVY
+
+
+@pytest.mark.parametrize("name", ["shard_dataset", "sample", "augment_sample", "voxelize"])
+def test_the_reader_of_shards_knows_the_contract_and_nothing_of_how_they_are_made(name):
+    tree = ast.parse((ROOT / "training" / f"{name}.py").read_text())
+    modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
+    records = {f"augkitti.{part}" for part in CONTRACT}
+    assert {module for module in modules if module.startswith("augkitti")} <= records
 
 
 def test_the_command_line_imports_nothing_slow_before_it_knows_the_command():
