@@ -95,8 +95,11 @@ def _augkitti(
     """Augmented KITTI: virtual cars with exact motion labels in real LiDAR scans."""
 
 
+_GO_ON = "; finished shards are kept, go on with --resume"
+
+
 @contextmanager
-def _answers() -> Iterator[None]:
+def _answers(at_end: str = "") -> Iterator[None]:
     """Bad input: one line on stderr, exit code 2. The machine gave way: 3. Interrupted: 130. Told to end: 143."""
     for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR"):  # read when numpy is imported, below
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # processes share the work, not threads
@@ -110,13 +113,13 @@ def _answers() -> Iterator[None]:
         print(f"augkitti: {err}", file=sys.stderr)
         raise typer.Exit(3) from None
     except _Terminated:
-        print("augkitti: told to end; finished shards are kept, go on with --resume", file=sys.stderr)
+        print(f"augkitti: told to end{at_end}", file=sys.stderr)
         raise typer.Exit(143) from None
     except BrokenProcessPool:
         print("augkitti: a worker process was killed; use fewer --jobs, memory may be short", file=sys.stderr)
         raise typer.Exit(3) from None
     except KeyboardInterrupt:
-        print("augkitti: interrupted; finished shards are kept, go on with --resume", file=sys.stderr)
+        print(f"augkitti: interrupted{at_end}", file=sys.stderr)
         raise typer.Exit(130) from None
     except BrokenPipeError:  # `augkitti ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -163,7 +166,7 @@ def generate(
     ] = False,
 ) -> None:
     """Real scan pairs in, the same with virtual cars and exact motion labels out, as Parquet shards."""
-    with _answers():
+    with _answers(_GO_ON):
         from pipelines.generate import generate as run
         from pipelines.run import read_options
 
@@ -194,7 +197,7 @@ def prepare(
     resume: Resume = False,
 ) -> None:
     """Stage 1 of generate. Reads scans and drive files; writes the cache, and the plan to OUT/.augkitti-work."""
-    with _answers():
+    with _answers(_GO_ON):
         from pipelines.generate import prepare_stage
         from pipelines.run import read_options
 

@@ -4,11 +4,13 @@ import re
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 from tiny_drive import write_drive
 from typer.testing import CliRunner
 
 import pipelines.cache
+import pipelines.cli as cli
 from augkitti.config import Config, load_config
 from augkitti.dataset_index import read_index
 from pipelines.cli import DEFAULT_OUT, app
@@ -188,3 +190,13 @@ def test_the_embedded_default_is_generated_and_checked_against_the_streets_in_th
     report = augkitti("validate", "aug", "--json", "report.json")
     assert report.exit_code == 0, report.output
     assert "--kitti" not in report.output, "the streets are found in the cache"
+
+
+@pytest.mark.parametrize(
+    ("at_end", "told"), [("; go on", "augkitti: interrupted; go on\n"), ("", "augkitti: interrupted\n")]
+)
+def test_an_interrupt_offers_to_go_on_only_where_a_command_can(capsys, at_end, told):
+    with pytest.raises(typer.Exit) as left, cli._answers(at_end):
+        raise KeyboardInterrupt
+    assert left.value.exit_code == 130
+    assert capsys.readouterr().err == told
