@@ -7,11 +7,13 @@ from hypothesis import strategies as st
 
 from augkitti.frames import box_pose, compose, footprint_corners, footprints_overlap, invert, is_rigid, transform_points
 from tests import hand_made_pair, pair_factory
-from training.augment_sample import augment_sample, flip, move_objects, scale, turn
+from training.augment_sample import augment_sample, flip, move_objects, move_observer, scale, turn
 from training.config import TrainConfig
 from training.sample import Sample, is_labelled, sample_of
 
-WILD = TrainConfig(rotation_rad=3.0, scale=0.4, flip=True, box_rotation_rad=0.8, box_shift_m=1.5)
+WILD = TrainConfig(
+    rotation_rad=3.0, scale=0.4, box_rotation_rad=0.8, box_shift_m=1.5, ego_shift_m=0.5, ego_turn_rad=0.05
+)
 STILL = TrainConfig(rotation_rad=0.0, scale=0.0, flip=False, box_rotation_rad=0.0, box_shift_m=0.0)
 MADE = [sample_of(hand_made_pair.make_pair()[0]), sample_of(pair_factory.make_pair(tick_step=8).pair)]
 samples = st.sampled_from(MADE)
@@ -205,6 +207,21 @@ def test_moved_objects_touch_no_other_and_only_they_move(sample, seed):
     ):
         still = ~np.isin(instance, changed)
         np.testing.assert_array_equal(old_xyz[still], new_xyz[still])
+
+
+@given(samples, st.floats(-0.2, 0.2), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
+@settings(max_examples=30, deadline=None)
+def test_a_moved_observer_sees_the_same_world_from_elsewhere(sample, turn_rad, x_m, y_m):
+    new = move_observer(sample, turn_rad, np.array([x_m, y_m]))
+    D = compose(new.ego_motion, invert(sample.ego_motion))
+    np.testing.assert_allclose(D[:3, 3], [x_m, y_m, 0.0], atol=1e-9)
+    assert np.arctan2(D[1, 0], D[0, 0]) == pytest.approx(turn_rad)
+    np.testing.assert_allclose(new.xyz1, transform_points(D, sample.xyz1), atol=1e-4)
+    for row in np.flatnonzero(sample.has_motion):  # as it moves in the world of scan 0, so it goes on
+        old, now = (compose(invert(s.ego_motion), s.motion[row]) for s in (sample, new))
+        np.testing.assert_allclose(now, old, atol=1e-9)
+    for field in ("xyz0", "boxes0", "reflectance0", "reflectance1"):
+        np.testing.assert_array_equal(getattr(new, field), getattr(sample, field))
 
 
 def test_an_object_can_be_moved():

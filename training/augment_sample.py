@@ -1,13 +1,16 @@
 """Augmentation of training pairs: a sample and a random generator in, a sample with all labels in step out.
 
 VoxelNet's three kinds, for pairs: single objects turned and shifted, then the whole scene scaled, turned about z and
-mirrored. Both scans, flow, boxes, motions and ego-motion change together:
+mirrored. A fourth is of pairs alone: the observer, moved before its second scan. Both scans, flow, boxes, motions and
+ego-motion change together:
 
 - The scene's map is linear, p' = A p with A = s Q (Q a turn, or a mirror). A motion M = (R, t) becomes (Q R Q^T, A t),
   flow becomes A v, so `flow = M p - p` stays. Scaling scales the translations of all motions, the ego car's too.
 - An object's move D (a turn about its own vertical axis, a shift in the plane) holds in the world of scan 0, so it is
   E D E^-1 in scan 1, and its motion becomes E D E^-1 M D^-1: seen from the street it drives the same way along its new
   heading, and what stands goes on standing.
+- The observer's move D takes scan 1 to D p, every motion and the ego-motion M to D M: as if it had driven otherwise,
+  but for shadows and rings on the ground, which stay those of where it was. A few ego-motions become many.
 """
 
 from dataclasses import replace
@@ -24,16 +27,20 @@ _EGO_BOX = np.array([0.0, 0.0, 0.0, 5.5, 2.4, 2.0, 0.0])  # the ego car, roughly
 
 
 def augment_sample(sample: Sample, config: TrainConfig, rng: np.random.Generator) -> Sample:
-    """Objects moved, then the scene scaled, turned and mirrored, by as much as `config` allows; draws are `rng`'s."""
+    """Objects and observer moved, then the scene scaled, turned and mirrored, as far as `config` allows."""
     count = len(sample.boxes0)
     turns = config.box_rotation_rad * rng.uniform(-1.0, 1.0, count)
     shifts = config.box_shift_m * rng.standard_normal((count, 2))
+    ego_turn = config.ego_turn_rad * rng.standard_normal()
+    ego_shift = config.ego_shift_m * rng.standard_normal(2)
     factor = 1.0 + config.scale * rng.uniform(-1.0, 1.0)
     angle_rad = config.rotation_rad * rng.uniform(-1.0, 1.0)
     mirror = config.flip and rng.random() < 0.5
     if turns.any() or shifts.any():
         sample = move_objects(sample, turns, shifts)
     A = factor * _about_z(angle_rad)
+    if ego_turn or ego_shift.any():
+        sample = move_observer(sample, ego_turn, ego_shift)
     if mirror:
         A = _MIRROR @ A
     return _mapped(sample, A, factor, angle_rad, mirror)  # one pass over the points
@@ -84,6 +91,24 @@ def move_objects(sample: Sample, turns_rad: F64, shifts_m: F64) -> Sample:
         flow0[mine0[known]] = _displacement(motion[row], xyz0[mine0[known]])
         flow0[mine0[~known]] = _displacement(E, xyz0[mine0[~known]])  # contract: where not known, E p - p
     return replace(sample, xyz0=xyz0, xyz1=xyz1, flow0=flow0, boxes0=boxes0, motion=motion)
+
+
+def move_observer(sample: Sample, turn_rad: float, shift_m: F64) -> Sample:
+    """The second scan seen from another place: velo1 after a turn about its z axis, then a shift in its plane.
+
+    Args:
+        sample: not changed.
+        turn_rad: of the world about the scanner, counter-clockwise.
+        shift_m: (2,) of the world along x and y.
+    """
+    D = rigid(_about_z(turn_rad), np.array([shift_m[0], shift_m[1], 0.0]))
+    return replace(
+        sample,
+        xyz1=_apply(D, sample.xyz1),
+        flow0=_apply(D, sample.xyz0 + sample.flow0) - sample.xyz0,
+        ego_motion=D @ sample.ego_motion,
+        motion=np.where(sample.has_motion[:, None, None], D @ sample.motion, sample.motion),
+    )
 
 
 _MIRROR = np.diag([1.0, -1.0, 1.0])

@@ -111,6 +111,8 @@ class TrainConfig(_Section):
     flip: bool = Field(True, description="mirror left and right in half of the training pairs")
     box_rotation_rad: float = Field(0.157, ge=0.0, description="largest turn of single objects about their own axis")
     box_shift_m: float = Field(0.5, ge=0.0, description="standard deviation of single objects' shifts")
+    ego_shift_m: float = Field(0.0, ge=0.0, description="standard deviation of the observer's shift before scan 1")
+    ego_turn_rad: float = Field(0.0, ge=0.0, description="standard deviation of its turn")
     frozen_norms: bool = Field(False, description="batch norms keep their running statistics, as when predicting")
     seed: int = Field(0, ge=0)
 
