@@ -1,7 +1,6 @@
-"""A pair of scans in, flow and ego-motion out, without any learning: the rows that stand beside the network.
+"""A pair of scans in, the flow of a world that stands as a whole out: the rows that stand beside the network.
 
-Each is called like the network, with a pair, and gives a `Prediction`. `Method` is what more of them look like: those
-that follow objects take the network's detections as the second argument, as the paper's baselines do ("+Det.").
+`Method` is what a baseline looks like: those that follow objects take detections as the second argument.
 """
 
 from collections.abc import Callable
@@ -29,9 +28,6 @@ def ego_true(pair: AugmentedPair, _: Prediction | None = None) -> Prediction:
 def ego_registration(pair: AugmentedPair, _: Prediction | None = None) -> Prediction:
     """Ego-motion by registration of the two scans (GICP, `augkitti.ego_motion.register`), and a standing world."""
     return _rigid_world("ego_registration", pair, register(pair.scan0.xyz, pair.scan1.xyz))
-
-
-BASELINES: dict[str, Method] = {"zero": zero, "ego_true": ego_true, "ego_registration": ego_registration}
 
 
 def rigid_flow(T_velo1_velo0: F64, xyz0: F32) -> F32:
