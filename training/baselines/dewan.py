@@ -1,0 +1,301 @@
+"""A pair and detections in, what Dewan et al. say of it out: flow of some points, motions of world and detections.
+
+Dewan, Caselitz, Tipaldi, Burgard, "Rigid Scene Flow for 3D LiDAR Scans", IROS 2016, pooled over detections and
+background as PointFlowNet's section 4 has it ("Dewan et al. + Det."). What stands on the ground is thinned to vertices,
+which are matched by SHOT (`shot`); the ground, where descriptors tell nothing, gives vertices without a match; a factor
+graph (`rigid_scene_flow`) then gives every vertex a motion of its own.
+
+An estimate counts where matches round a vertex bear its motion out; only points beside such a vertex have flow, that of
+the vertex. Their share is the coverage that `score` gives. Flow stays that of the points, also in boxes: pooled motions
+are the figures of objects and of ego-motion, and pooling them would hide what the method says. `dewan` does what the
+paper does, with descriptors in frames of their own, and matches anywhere within the largest motion; `dewan_strong` lays
+the scans over each other first (`augkitti.ego_motion.register`), so that matches are looked for within what things move
+over ground, describes in upright frames, asks matches to be mutual, and follows the energy's motions once more with the
+nearest points in place of matches.
+
+Defined results: without detections there are no motions of objects; an object with fewer than three points that have
+flow moves with the ego-motion; with nothing matched on the background the ego-motion is the start's (the identity,
+or registration in `dewan_strong`); two empty or bare scans have flow nowhere; nothing is ever NaN.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from augkitti.config import GroundConfig
+from augkitti.ego_motion import register
+from augkitti.frames import F32, F64, transform_points
+from augkitti.ground import fit_ground, standing_points
+from augkitti.scan_pair import I64, AugmentedPair, Bool
+from training.baselines.followed import FEWEST_POINTS, boxes_of, object_points
+from training.baselines.rigid_fit import fit_rigid, ransac_rigid
+from training.baselines.rigid_scene_flow import Energy, MotionGraph, Motions, solve_motions, standing
+from training.baselines.shot import describe, reference_frames, support_of, upright_frames
+from training.predictions import Prediction
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where flow is looked for, in velo0; elsewhere no point has an estimate."""
+
+    x_m: tuple[float, float] = (-5.0, 45.0)
+    y_m: tuple[float, float] = (-30.0, 30.0)
+    z_m: tuple[float, float] = (-4.0, 3.0)
+
+
+@dataclass(frozen=True)
+class DewanConfig:
+    """Sizes and thresholds; those of the paper's method."""
+
+    name: str = "dewan"
+    region: Region = Region()
+    surface_m: float = 0.15  # a scan is thinned to one point a cell of so much, on which descriptors are taken
+    normal_points: int = 12  # that a normal is fitted to
+    radius_m: float = 1.5  # of descriptors
+    vertex_m: float = 0.4  # cells of vertices on what stands
+    target_m: float = 0.2  # cells of what they are matched to: finer, since a match is no better than its grid
+    ground_m: float = 1.0  # cells of vertices on the ground
+    window_m: float = 3.0  # the largest motion
+    laid_over: bool = False  # scans are registered first
+    upright: bool = False  # descriptors in upright frames
+    mutual: bool = False  # a match is one only if no other vertex beside it fits its target better
+    refined: int = 0  # rounds with the nearest points in place of matches
+    energy: Energy = field(default_factory=Energy)
+    neighbours: int = 8  # of each vertex, at most
+    reach_m: float = 1.2  # to neighbours on what stands
+    voters: int = 16  # matches round a vertex that choose its start
+    agree_m: float = 0.4  # matches that the motion of a vertex misses by less bear it out
+    bear_out: int = 5  # as many have to, of the `voters` nearest
+    bear_out_m: float = 4.0  # and no further away
+    beside_m: float = 0.6  # a point has the motion of the vertex that is no further away
+
+
+PAPER = DewanConfig()
+STRONG = replace(PAPER, name="dewan_strong", window_m=2.5, laid_over=True, upright=True, mutual=True, refined=2)
+
+
+def dewan(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
+    """As the paper has it: flow where matches bear it out, pooled by least squares over detections and background."""
+    return scene_flow_of(pair, detections, PAPER)
+
+
+def dewan_strong(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
+    """As strong as it can be made today; see above."""
+    return scene_flow_of(pair, detections, STRONG)
+
+
+def scene_flow_of(pair: AugmentedPair, detections: Prediction | None, config: DewanConfig) -> Prediction:
+    """Either of the two; the module tells how."""
+    start = register(pair.scan0.xyz, pair.scan1.xyz) if config.laid_over else np.eye(4)
+    scan0 = thinned(pair.scan0.xyz, start, config.region, config.vertex_m, config)
+    # what leaves the region is still found
+    scan1 = thinned(pair.scan1.xyz, np.eye(4), _grown(config.region, 4.0), config.target_m, config)
+    motions, valid = estimate(scan0, scan1, config)
+    flow, where = painted(pair.scan0.xyz, start, motions, valid, config)
+    return pooled(pair, detections, flow, where, start, config)
+
+
+@dataclass(frozen=True, eq=False)
+class Thinned:
+    """A scan as the method sees it; in velo1, that of scan 0 as far as the start lays it there."""
+
+    surface: F64  # (S, 3) of what stands, or hangs, above the ground
+    normals: F64  # (S, 3) towards the scanner
+    upright: F64  # (A, 3) vertices upon it
+    ground: F64  # (G, 3) vertices on the ground
+
+
+def thinned(xyz: F32, T_velo1_velo: F64, region: Region, cell_m: float, config: DewanConfig) -> Thinned:
+    """A scan (N, 3) cut to the region, and thinned: cells of `cell_m` on what stands, of `config.ground_m` below."""
+    stands = np.zeros(len(xyz), dtype=bool)
+    stands[standing_points(xyz, fit_ground(xyz, GroundConfig()))] = True
+    kept = _inside(xyz, region)
+    upright = transform_points(T_velo1_velo, xyz[kept & stands])
+    surface = cell_means(upright, config.surface_m)
+    towards = surface - T_velo1_velo[:3, 3]
+    normals = fit_normals(surface, config.normal_points)
+    normals *= np.where(np.einsum("sa,sa->s", normals, towards) > 0.0, -1.0, 1.0)[:, None]
+    ground = cell_means(transform_points(T_velo1_velo, xyz[kept & ~stands]), config.ground_m)
+    return Thinned(surface, normals, cell_means(upright, cell_m), ground)
+
+
+def cell_means(points: F64, cell_m: float) -> F64:
+    """The mean of the points (N, 3) in each cube of `cell_m` that holds some, (C, 3)."""
+    if not len(points):
+        return np.zeros((0, 3))
+    cell = np.floor(points / cell_m).astype(np.int64) + (1 << 20)
+    _, which = np.unique((cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2], return_inverse=True)
+    count = np.bincount(which)
+    return np.stack([np.bincount(which, points[:, k]) / count for k in range(3)], axis=1)
+
+
+def fit_normals(points: F64, count: int) -> F64:
+    """Unit normals (N, 3), of unknown side: the direction in which the `count` nearest points spread least."""
+    if len(points) < 3:
+        return np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    _, near = cKDTree(points).query(points, min(count, len(points)))
+    away = points[near] - points[near].mean(axis=1, keepdims=True)
+    return np.asarray(np.linalg.eigh(np.einsum("nka,nkb->nab", away, away))[1][:, :, 0])
+
+
+def descriptors(scan: Thinned, config: DewanConfig) -> F32:
+    """SHOT (A, 352) of the upright vertices."""
+    support = support_of(scan.surface, scan.upright, config.radius_m)
+    frames = upright_frames(scan.upright) if config.upright else reference_frames(support)
+    return describe(support, scan.normals, frames)
+
+
+def best_matches(xyz0: F64, said0: F32, xyz1: F64, said1: F32, config: DewanConfig) -> tuple[I64, I64]:
+    """Rows (D,), (D,) of vertices and of what resembles each most within the largest motion, by the descriptors.
+
+    With `config.mutual` what a target resembles most has to lie beside the vertex.
+    """
+    nothing = np.zeros(0, dtype=np.int64)
+    told0, told1 = said0.any(axis=1), said1.any(axis=1)
+    if not told0.any() or not told1.any():
+        return nothing, nothing
+    best, score = np.full(len(xyz0), -1), np.full(len(xyz0), -np.inf)
+    back, back_score = np.full(len(xyz1), -1), np.full(len(xyz1), -np.inf)
+    block = np.floor(xyz0[:, :2] / _BLOCK_M).astype(np.int64)
+    _, block = np.unique((block[:, 0] << 32) + block[:, 1], return_inverse=True)
+    for k in range(int(block.max()) + 1):
+        rows = np.flatnonzero((block == k) & told0)
+        if not len(rows):
+            continue
+        low, high = xyz0[rows].min(axis=0) - config.window_m, xyz0[rows].max(axis=0) + config.window_m
+        columns = np.flatnonzero(told1 & ((xyz1 >= low) & (xyz1 <= high)).all(axis=1))
+        if not len(columns):
+            continue
+        alike = said0[rows] @ said1[columns].T
+        apart = ((xyz0[rows, None] - xyz1[None, columns]) ** 2).sum(axis=2)
+        alike[apart > config.window_m**2] = -np.inf
+        at = alike.argmax(axis=1)
+        best[rows], score[rows] = columns[at], alike[np.arange(len(rows)), at]
+        at = alike.argmax(axis=0)
+        value = alike[at, np.arange(len(columns))]
+        better = value > back_score[columns]
+        back[columns[better]], back_score[columns[better]] = rows[at[better]], value[better]
+    rows = np.flatnonzero(np.isfinite(score))
+    if config.mutual:
+        rows = rows[np.linalg.norm(xyz0[back[best[rows]]] - xyz0[rows], axis=1) < 1.5 * config.vertex_m]
+    return rows, best[rows]
+
+
+def neighbours_of(upright: F64, ground: F64, config: DewanConfig) -> I64:
+    """Pairs (E, 2) of vertices, upright ones first: the nearest within reach, and the ground below with what stands."""
+    first = len(upright)
+    some = [
+        _nearest(upright, upright, config.neighbours + 1, config.reach_m),
+        _nearest(ground, ground, config.neighbours + 1, _GROUND_REACH_M) + first,
+        _nearest(ground, upright, 2, config.reach_m) + [first, 0],
+    ]
+    pairs = np.sort(np.concatenate(some), axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+
+
+def voted(xyz: F64, at: F64, shift: F64, config: DewanConfig) -> F64:
+    """A shift (V, 3) for each vertex: that of the matches (D, 3) round it which most others there agree with."""
+    if not len(at):
+        return np.zeros_like(xyz)
+    _, near = cKDTree(at).query(xyz, np.arange(1, min(config.voters, len(at)) + 1))
+    said = shift[near]
+    agree = ((said[:, :, None] - said[:, None]) ** 2).sum(axis=3) < config.agree_m**2
+    most = agree.sum(axis=2).argmax(axis=1)
+    chosen = agree[np.arange(len(xyz)), most]
+    return np.asarray(np.einsum("vk,vka->va", chosen, said) / chosen.sum(axis=1)[:, None])
+
+
+def borne_out(motions: Motions, at: F64, target: F64, config: DewanConfig) -> Bool:
+    """Which vertices (V,) have a motion that enough of the nearest matches (D, 3) to (D, 3) agree with."""
+    valid = np.zeros(len(motions.xyz), dtype=bool)
+    if not len(at) or not len(valid):
+        return valid
+    distance, near = cKDTree(at).query(motions.xyz, np.arange(1, min(config.voters, len(at)) + 1))
+    vertex = np.repeat(np.arange(len(valid)), near.shape[1])
+    off = np.linalg.norm(motions.moved(vertex, at[near.reshape(-1)]) - target[near.reshape(-1)], axis=1)
+    good = (off.reshape(near.shape) < config.agree_m) & (distance < config.bear_out_m)
+    return np.asarray(good.sum(axis=1) >= config.bear_out)
+
+
+def estimate(scan0: Thinned, scan1: Thinned, config: DewanConfig) -> tuple[Motions, Bool]:
+    """The motion of every vertex of scan 0, upright ones first, and which of them count."""
+    rows, targets = best_matches(
+        scan0.upright, descriptors(scan0, config), scan1.upright, descriptors(scan1, config), config
+    )
+    xyz = np.concatenate([scan0.upright, scan0.ground])
+    at, target = scan0.upright[rows], scan1.upright[targets]
+    start = standing(xyz, voted(xyz, at, target - at, config))
+    graph = MotionGraph(xyz, rows, target, None, neighbours_of(scan0.upright, scan0.ground, config))
+    motions = solve_motions(graph, start, config.energy)
+    return motions, borne_out(motions, at, target, config)
+
+
+def painted(xyz: F32, start: F64, motions: Motions, valid: Bool, config: DewanConfig) -> tuple[F32, Bool]:
+    """Flow (N, 3) of a scan's points, that of the nearest vertex, and where there is one that counts (N,)."""
+    flow, where = np.zeros((len(xyz), 3), np.float32), np.zeros(len(xyz), dtype=bool)
+    rows = np.flatnonzero(_inside(xyz, config.region))
+    if not valid.any() or not len(rows):
+        return flow, where
+    laid = transform_points(start, xyz[rows])
+    distance, vertex = cKDTree(motions.xyz).query(laid, distance_upper_bound=max(config.beside_m, config.ground_m))
+    beside = np.isfinite(distance)
+    rows, laid, vertex = rows[beside], laid[beside], vertex[beside]
+    rows, laid, vertex = (part[valid[vertex]] for part in (rows, laid, vertex))
+    flow[rows] = motions.moved(vertex, laid) - xyz[rows]
+    where[rows] = True
+    return flow, where
+
+
+def pooled(
+    pair: AugmentedPair, detections: Prediction | None, flow: F32, where: Bool, start: F64, config: DewanConfig
+) -> Prediction:
+    """What is said of the pair, with motions pooled over the points that have flow in each detection, and outside."""
+    boxes = boxes_of(detections)
+    inside = object_points(pair.scan0.xyz, boxes)
+    background = where.copy()
+    for rows in inside:
+        background[rows] = False
+    ego_motion = _pool(pair.scan0.xyz, flow, np.flatnonzero(background), start, config)
+    motions = [_pool(pair.scan0.xyz, flow, rows[where[rows]], ego_motion, config) for rows in inside]
+    return Prediction(
+        pair.pair_id,
+        {config.name: flow},
+        where,
+        ego_motion=ego_motion,
+        boxes=boxes,
+        scores=np.zeros(0) if detections is None or detections.scores is None else detections.scores,
+        motions=np.array(motions).reshape(-1, 4, 4),
+    )
+
+
+def _pool(xyz: F32, flow: F32, rows: I64, otherwise: F64, config: DewanConfig) -> F64:
+    if len(rows) < FEWEST_POINTS:
+        return otherwise
+    rows = rows[:: 1 + len(rows) // 4000]
+    points = xyz[rows].astype(np.float64)
+    if not config.laid_over:
+        return fit_rigid(points, points + flow[rows])
+    return ransac_rigid(points, points + flow[rows], 0.1, np.random.default_rng(0), draws=100)[0]
+
+
+_BLOCK_M = 6.0  # vertices that are compared at once
+_GROUND_REACH_M = 6.0  # rings on the ground are as far apart as this
+
+
+def _nearest(of: F64, among: F64, count: int, reach_m: float) -> I64:
+    """Pairs (P, 2) of rows: each with the `count` nearest within reach."""
+    if not len(of) or not len(among):
+        return np.zeros((0, 2), dtype=np.int64)
+    distance, near = cKDTree(among).query(of, np.arange(1, min(count, len(among)) + 1), distance_upper_bound=reach_m)
+    row, column = np.nonzero(np.isfinite(distance))
+    return np.stack([row, near[row, column]], axis=1).astype(np.int64)
+
+
+def _inside(xyz: F32, region: Region) -> Bool:
+    low, high = np.transpose([region.x_m, region.y_m, region.z_m]).astype(np.float32)
+    return np.asarray(((xyz >= low) & (xyz < high)).all(axis=1))
+
+
+def _grown(region: Region, by_m: float) -> Region:
+    return Region(*((low - by_m, high + by_m) for low, high in (region.x_m, region.y_m, region.z_m)))
