@@ -10,8 +10,8 @@ the vertex. Their share is the coverage that `score` gives. Flow stays that of t
 are the figures of objects and of ego-motion, and pooling them would hide what the method says. `dewan` does what the
 paper does, with descriptors in frames of their own, and matches anywhere within the largest motion; `dewan_strong` lays
 the scans over each other first (`augkitti.ego_motion.register`), so that matches are looked for within what things move
-over ground, describes in upright frames, asks matches to be mutual, and follows the energy's motions once more with the
-nearest points in place of matches.
+over ground, describes in upright frames, asks matches to be mutual, and then draws the
+surfaces that the motions lay over each other together, point to plane.
 
 Defined results: without detections there are no motions of objects; an object with fewer than three points that have
 flow moves with the ego-motion; with nothing matched on the background the ego-motion is the start's (the identity,
@@ -30,7 +30,7 @@ from augkitti.ground import fit_ground, standing_points
 from augkitti.scan_pair import I64, AugmentedPair, Bool
 from training.baselines.followed import FEWEST_POINTS, boxes_of, object_points
 from training.baselines.rigid_fit import fit_rigid, ransac_rigid
-from training.baselines.rigid_scene_flow import Energy, MotionGraph, Motions, solve_motions, standing
+from training.baselines.rigid_scene_flow import Energy, MotionGraph, Motions, moved_by, solve_motions, standing
 from training.baselines.shot import describe, reference_frames, support_of, upright_frames
 from training.predictions import Prediction
 
@@ -60,19 +60,23 @@ class DewanConfig:
     laid_over: bool = False  # scans are registered first
     upright: bool = False  # descriptors in upright frames
     mutual: bool = False  # a match is one only if no other vertex beside it fits its target better
-    refined: int = 0  # rounds with the nearest points in place of matches
+    refined: int = 0  # rounds in which surfaces are drawn to each other, too
+    near_m: float = 0.5  # surfaces that belong together are no further apart
     energy: Energy = field(default_factory=Energy)
+    fine: Energy = field(default_factory=lambda: Energy(match_m=0.05, match_off_m=0.2, steps=2))  # of these rounds
     neighbours: int = 8  # of each vertex, at most
     reach_m: float = 1.2  # to neighbours on what stands
     voters: int = 16  # matches round a vertex that choose its start
     agree_m: float = 0.4  # matches that the motion of a vertex misses by less bear it out
     bear_out: int = 5  # as many have to, of the `voters` nearest
     bear_out_m: float = 4.0  # and no further away
+    ground_reach_m: float = 8.0  # the same for the ground, which is one body
+    still_m: float = 0.15  # the ground's motion is borne out by what stands and moves within so much of it
     beside_m: float = 0.6  # a point has the motion of the vertex that is no further away
 
 
 PAPER = DewanConfig()
-STRONG = replace(PAPER, name="dewan_strong", window_m=2.5, laid_over=True, upright=True, mutual=True, refined=2)
+STRONG = replace(PAPER, name="dewan_strong", window_m=3.5, laid_over=True, upright=True, mutual=True, refined=2)
 
 
 def dewan(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
@@ -90,9 +94,10 @@ def scene_flow_of(pair: AugmentedPair, detections: Prediction | None, config: De
     start = register(pair.scan0.xyz, pair.scan1.xyz) if config.laid_over else np.eye(4)
     scan0 = thinned(pair.scan0.xyz, start, config.region, config.vertex_m, config)
     # what leaves the region is still found
-    scan1 = thinned(pair.scan1.xyz, np.eye(4), _grown(config.region, 4.0), config.target_m, config)
-    motions, valid = estimate(scan0, scan1, config)
-    flow, where = painted(pair.scan0.xyz, start, motions, valid, config)
+    scan1 = thinned(pair.scan1.xyz, np.eye(4), _grown(config.region, config.window_m), config.target_m, config)
+    upright = upright_motions(scan0, scan1, config)
+    ground = ground_motions(scan0, upright, config)
+    flow, where = painted(pair.scan0.xyz, start, scan0.stands, upright, ground, config)
     return pooled(pair, detections, flow, where, start, config)
 
 
@@ -100,10 +105,19 @@ def scene_flow_of(pair: AugmentedPair, detections: Prediction | None, config: De
 class Thinned:
     """A scan as the method sees it; in velo1, that of scan 0 as far as the start lays it there."""
 
-    surface: F64  # (S, 3) of what stands, or hangs, above the ground
+    stands: Bool  # (N,) points of the scan that stand, or hang, above the ground
+    surface: F64  # (S, 3) of these, in the region
     normals: F64  # (S, 3) towards the scanner
     upright: F64  # (A, 3) vertices upon it
     ground: F64  # (G, 3) vertices on the ground
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Motions of V vertices, and which of them count."""
+
+    motions: Motions
+    valid: Bool  # (V,)
 
 
 def thinned(xyz: F32, T_velo1_velo: F64, region: Region, cell_m: float, config: DewanConfig) -> Thinned:
@@ -111,13 +125,13 @@ def thinned(xyz: F32, T_velo1_velo: F64, region: Region, cell_m: float, config: 
     stands = np.zeros(len(xyz), dtype=bool)
     stands[standing_points(xyz, fit_ground(xyz, GroundConfig()))] = True
     kept = _inside(xyz, region)
-    upright = transform_points(T_velo1_velo, xyz[kept & stands])
-    surface = cell_means(upright, config.surface_m)
-    towards = surface - T_velo1_velo[:3, 3]
+    points = transform_points(T_velo1_velo, xyz[kept & stands])
+    surface = cell_means(points, config.surface_m)
+    away = surface - T_velo1_velo[:3, 3]
     normals = fit_normals(surface, config.normal_points)
-    normals *= np.where(np.einsum("sa,sa->s", normals, towards) > 0.0, -1.0, 1.0)[:, None]
+    normals *= np.where(np.einsum("sa,sa->s", normals, away) > 0.0, -1.0, 1.0)[:, None]
     ground = cell_means(transform_points(T_velo1_velo, xyz[kept & ~stands]), config.ground_m)
-    return Thinned(surface, normals, cell_means(upright, cell_m), ground)
+    return Thinned(stands, surface, normals, cell_means(points, cell_m), ground)
 
 
 def cell_means(points: F64, cell_m: float) -> F64:
@@ -182,21 +196,79 @@ def best_matches(xyz0: F64, said0: F32, xyz1: F64, said1: F32, config: DewanConf
     return rows, best[rows]
 
 
-def neighbours_of(upright: F64, ground: F64, config: DewanConfig) -> I64:
-    """Pairs (E, 2) of vertices, upright ones first: the nearest within reach, and the ground below with what stands."""
-    first = len(upright)
-    some = [
-        _nearest(upright, upright, config.neighbours + 1, config.reach_m),
-        _nearest(ground, ground, config.neighbours + 1, _GROUND_REACH_M) + first,
-        _nearest(ground, upright, 2, config.reach_m) + [first, 0],
-    ]
-    pairs = np.sort(np.concatenate(some), axis=1)
+def upright_motions(scan0: Thinned, scan1: Thinned, config: DewanConfig) -> Estimate:
+    """The motion of every upright vertex of scan 0, from matches and neighbours."""
+    said0, said1 = descriptors(scan0, config), descriptors(scan1, config)
+    rows, targets = best_matches(scan0.upright, said0, scan1.upright, said1, config)
+    at, target = scan0.upright[rows], scan1.upright[targets]
+    edges = neighbours_of(scan0.upright, config.neighbours, config.reach_m)
+    start = standing(scan0.upright, voted(scan0.upright, at, target - at, config))
+    graph = MotionGraph(scan0.upright, rows, at, target, np.tile(np.eye(3), (len(rows), 1, 1)), edges)
+    motions = solve_motions(graph, start, config.energy)
+    for _ in range(config.refined):
+        motions = solve_motions(with_surfaces(graph, motions, scan0, scan1, config), motions, config.fine)
+    return Estimate(motions, borne_out(motions, at, target, config.agree_m, config.bear_out_m, config))
+
+
+def with_surfaces(
+    graph: MotionGraph, motions: Motions, scan0: Thinned, scan1: Thinned, config: DewanConfig
+) -> MotionGraph:
+    """The graph with every surface point beside a vertex drawn to the plane of scan 1 that it lies nearest to.
+
+    Along that plane it is drawn as little as by a match, whose own say shrinks as much: in `config.fine`'s spread.
+    """
+    distance, vertex = cKDTree(graph.xyz).query(scan0.surface, distance_upper_bound=config.beside_m)
+    point, vertex = scan0.surface[np.isfinite(distance)], vertex[np.isfinite(distance)]
+    distance, near = cKDTree(scan1.surface).query(motions.moved(vertex, point), distance_upper_bound=config.near_m)
+    met = np.isfinite(distance)
+    point, vertex, near = point[met], vertex[met], near[met]
+    normal = scan1.normals[near]
+    loose = (config.fine.match_m / config.energy.match_m) ** 2
+    plane = (1.0 - loose) * np.einsum("da,db->dab", normal, normal) + loose * np.eye(3)
+    return MotionGraph(
+        graph.xyz,
+        np.concatenate([graph.matched, vertex]),
+        np.concatenate([graph.point, point]),
+        np.concatenate([graph.target, scan1.surface[near]]),
+        np.concatenate([loose * graph.information, plane]),
+        graph.edges,
+    )
+
+
+def ground_motions(scan0: Thinned, upright: Estimate, config: DewanConfig) -> Estimate:
+    """The motion of every vertex on the ground, whose descriptors say nothing: that of what stands on it.
+
+    Around the motion that most of what stands has, so that the ground does not follow what drives over it.
+    """
+    rows = np.flatnonzero(upright.valid)
+    at = upright.motions.xyz[rows]
+    target = at + upright.motions.shift[rows]
+    most, _ = ransac_rigid(at, target, config.still_m, np.random.default_rng(0), draws=100)
+    start = moved_by(most, scan0.ground)
+    near = _nearest(scan0.ground, at, config.neighbours, config.ground_reach_m)
+    vertex, said = near[:, 0], rows[near[:, 1]]
+    point = scan0.ground[vertex]
+    graph = MotionGraph(
+        scan0.ground,
+        vertex,
+        point,
+        upright.motions.moved(said, point),
+        np.tile(np.eye(3), (len(vertex), 1, 1)),
+        neighbours_of(scan0.ground, config.neighbours, _GROUND_REACH_M),
+    )
+    motions = solve_motions(graph, start, replace(config.energy, match_off_m=config.still_m))
+    return Estimate(motions, borne_out(motions, at, target, config.still_m, config.ground_reach_m, config))
+
+
+def neighbours_of(xyz: F64, count: int, reach_m: float) -> I64:
+    """Pairs (E, 2) of vertices (V, 3): each with the `count` nearest within reach, no pair twice."""
+    pairs = np.sort(_nearest(xyz, xyz, count + 1, reach_m), axis=1)
     return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
 
 
 def voted(xyz: F64, at: F64, shift: F64, config: DewanConfig) -> F64:
     """A shift (V, 3) for each vertex: that of the matches (D, 3) round it which most others there agree with."""
-    if not len(at):
+    if not len(at) or not len(xyz):
         return np.zeros_like(xyz)
     _, near = cKDTree(at).query(xyz, np.arange(1, min(config.voters, len(at)) + 1))
     said = shift[near]
@@ -206,44 +278,37 @@ def voted(xyz: F64, at: F64, shift: F64, config: DewanConfig) -> F64:
     return np.asarray(np.einsum("vk,vka->va", chosen, said) / chosen.sum(axis=1)[:, None])
 
 
-def borne_out(motions: Motions, at: F64, target: F64, config: DewanConfig) -> Bool:
-    """Which vertices (V,) have a motion that enough of the nearest matches (D, 3) to (D, 3) agree with."""
+def borne_out(motions: Motions, at: F64, target: F64, within_m: float, reach_m: float, config: DewanConfig) -> Bool:
+    """Which vertices (V,) have a motion that takes enough of the nearest points (D, 3) to their targets (D, 3)."""
     valid = np.zeros(len(motions.xyz), dtype=bool)
     if not len(at) or not len(valid):
         return valid
     distance, near = cKDTree(at).query(motions.xyz, np.arange(1, min(config.voters, len(at)) + 1))
     vertex = np.repeat(np.arange(len(valid)), near.shape[1])
     off = np.linalg.norm(motions.moved(vertex, at[near.reshape(-1)]) - target[near.reshape(-1)], axis=1)
-    good = (off.reshape(near.shape) < config.agree_m) & (distance < config.bear_out_m)
+    good = (off.reshape(near.shape) < within_m) & (distance < reach_m)
     return np.asarray(good.sum(axis=1) >= config.bear_out)
 
 
-def estimate(scan0: Thinned, scan1: Thinned, config: DewanConfig) -> tuple[Motions, Bool]:
-    """The motion of every vertex of scan 0, upright ones first, and which of them count."""
-    rows, targets = best_matches(
-        scan0.upright, descriptors(scan0, config), scan1.upright, descriptors(scan1, config), config
-    )
-    xyz = np.concatenate([scan0.upright, scan0.ground])
-    at, target = scan0.upright[rows], scan1.upright[targets]
-    start = standing(xyz, voted(xyz, at, target - at, config))
-    graph = MotionGraph(xyz, rows, target, None, neighbours_of(scan0.upright, scan0.ground, config))
-    motions = solve_motions(graph, start, config.energy)
-    return motions, borne_out(motions, at, target, config)
+def painted(
+    xyz: F32, start: F64, stands: Bool, upright: Estimate, ground: Estimate, config: DewanConfig
+) -> tuple[F32, Bool]:
+    """Flow (N, 3) of a scan's points, that of the nearest vertex, and where there is one that counts (N,).
 
-
-def painted(xyz: F32, start: F64, motions: Motions, valid: Bool, config: DewanConfig) -> tuple[F32, Bool]:
-    """Flow (N, 3) of a scan's points, that of the nearest vertex, and where there is one that counts (N,)."""
+    What stands has that of upright vertices, all else that of vertices on the ground.
+    """
     flow, where = np.zeros((len(xyz), 3), np.float32), np.zeros(len(xyz), dtype=bool)
-    rows = np.flatnonzero(_inside(xyz, config.region))
-    if not valid.any() or not len(rows):
-        return flow, where
-    laid = transform_points(start, xyz[rows])
-    distance, vertex = cKDTree(motions.xyz).query(laid, distance_upper_bound=max(config.beside_m, config.ground_m))
-    beside = np.isfinite(distance)
-    rows, laid, vertex = rows[beside], laid[beside], vertex[beside]
-    rows, laid, vertex = (part[valid[vertex]] for part in (rows, laid, vertex))
-    flow[rows] = motions.moved(vertex, laid) - xyz[rows]
-    where[rows] = True
+    inside = _inside(xyz, config.region)
+    for mine, said, beside_m in ((stands, upright, config.beside_m), (~stands, ground, config.ground_m)):
+        rows = np.flatnonzero(inside & mine)
+        if not said.valid.any() or not len(rows):
+            continue
+        laid = transform_points(start, xyz[rows])
+        distance, vertex = cKDTree(said.motions.xyz).query(laid, distance_upper_bound=beside_m)
+        kept = np.isfinite(distance)
+        kept[kept] = said.valid[vertex[kept]]
+        flow[rows[kept]] = said.motions.moved(vertex[kept], laid[kept]) - xyz[rows[kept]]
+        where[rows[kept]] = True
     return flow, where
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from augkitti.frames import F64
+from augkitti.frames import F64, transform_points
 from augkitti.scan_pair import I64
 
 
@@ -24,8 +24,9 @@ class MotionGraph:
 
     xyz: F64  # (V, 3) metres
     matched: I64  # (D,) rows of vertices; one may come more than once
-    target: F64  # (D, 3) where the match lies in the second scan
-    target_axes: F64 | None  # (D, 3, 3) information of each match, relative to Energy.match_m; None: the same all round
+    point: F64  # (D, 3) what moves with the vertex: itself, or a point beside it
+    target: F64  # (D, 3) where its match lies in the second scan
+    information: F64  # (D, 3, 3) of each match, in units of 1 / Energy.match_m^2: the identity, or less along a surface
     edges: I64  # (E, 2) rows of vertices, no pair twice
 
 
@@ -62,6 +63,12 @@ def standing(xyz: F64, shift: F64 | None = None) -> Motions:
     return Motions(xyz, turn, np.zeros_like(xyz) if shift is None else shift)
 
 
+def moved_by(T: F64, xyz: F64) -> Motions:
+    """Vertices (V, 3) that all follow one motion (4, 4)."""
+    turn = np.broadcast_to(T[:3, :3], (len(xyz), 3, 3)).copy()
+    return Motions(xyz, turn, transform_points(T, xyz) - xyz)
+
+
 def solve_motions(graph: MotionGraph, start: Motions, energy: Energy) -> Motions:
     """The motions of least energy near `start`: Levenberg-Marquardt on reweighted least squares, a direct solver.
 
@@ -90,7 +97,7 @@ def solve_motions(graph: MotionGraph, start: Motions, energy: Energy) -> Motions
 
 def energy_of(graph: MotionGraph, motions: Motions, energy: Energy) -> float:
     """The sum of both terms, each with its Geman-McClure kernel `s r^2 / (s + r^2)`, r^2 in units of its spread."""
-    match = _match_square(graph, _match_residual(graph, motions)) / energy.match_m**2
+    match = _match_square(graph, _match_residual(graph, motions)[0], energy)
     shift, turn, _, _ = _edge_residual(graph, motions)
     edge = _edge_square(shift, turn, energy)
     bound_match, bound_edge = _bounds(energy)
@@ -101,14 +108,16 @@ def _bounds(energy: Energy) -> tuple[float, float]:
     return (energy.match_off_m / energy.match_m) ** 2, (energy.neighbour_off_m / energy.neighbour_m) ** 2
 
 
-def _match_residual(graph: MotionGraph, motions: Motions) -> F64:
-    """(D, 3) `T_i p_i - q_i`: a vertex stays where its rotation pivots."""
-    return np.asarray(graph.xyz[graph.matched] + motions.shift[graph.matched] - graph.target)
+def _match_residual(graph: MotionGraph, motions: Motions) -> tuple[F64, F64]:
+    """(D, 3) `T_i p - q`, and p's (turned) arm from its vertex."""
+    away = graph.point - graph.xyz[graph.matched]
+    arm = np.einsum("dab,db->da", motions.rotation[graph.matched], away)
+    return graph.xyz[graph.matched] + motions.shift[graph.matched] + arm - graph.target, arm
 
 
-def _match_square(graph: MotionGraph, residual: F64) -> F64:
-    along = residual if graph.target_axes is None else np.einsum("dab,db->da", graph.target_axes, residual)
-    return np.asarray(np.einsum("da,da->d", residual, along))
+def _match_square(graph: MotionGraph, residual: F64, energy: Energy) -> F64:
+    square = np.einsum("da,dab,db->d", residual, graph.information, residual)
+    return np.asarray(square / energy.match_m**2)
 
 
 def _edge_residual(graph: MotionGraph, motions: Motions) -> tuple[F64, F64, F64, F64]:
@@ -138,14 +147,12 @@ def _normal_equations(
     A step is (shift, rotation vector) of a vertex: `shift + v`, `exp(w) rotation`.
     """
     bound_match, bound_edge = _bounds(energy)
-    residual = _match_residual(graph, motions)
-    square = _match_square(graph, residual) / energy.match_m**2
-    trust = (bound_match / (bound_match + square)) ** 2 / energy.match_m**2
-    information = np.broadcast_to(np.eye(3), (len(residual), 3, 3)) if graph.target_axes is None else graph.target_axes
-    information = trust[:, None, None] * information
-    blocks = np.zeros((len(residual), 6, 7))
-    blocks[:, :3, :3] = information
-    blocks[:, :3, 6] = np.einsum("dab,db->da", information, residual)
+    residual, arm = _match_residual(graph, motions)
+    trust = (bound_match / (bound_match + _match_square(graph, residual, energy))) ** 2 / energy.match_m**2
+    jacobian = np.zeros((len(residual), 3, 6))
+    jacobian[:, :, :3], jacobian[:, :, 3:] = np.eye(3), -_cross(arm)
+    weighed = np.einsum("dak,dab->dkb", jacobian, trust[:, None, None] * graph.information)
+    blocks = np.concatenate([weighed @ jacobian, weighed @ residual[:, :, None]], axis=2)
     total = pattern.sum_matches(blocks)
 
     shift, turn, arm_i, arm_j = _edge_residual(graph, motions)
