@@ -72,10 +72,10 @@ def moved_by(T: F64, xyz: F64) -> Motions:
 def solve_motions(graph: MotionGraph, start: Motions, energy: Energy) -> Motions:
     """The motions of least energy near `start`: Levenberg-Marquardt on reweighted least squares, a direct solver.
 
-    Vertices that no match reaches keep the start's motion, or take up what their neighbours have. Without vertices,
-    matches and edges the start comes back.
+    Vertices without a match take up what their neighbours have, and keep the start where none has one. Without
+    matches the start comes back.
     """
-    if not len(graph.xyz) or (not len(graph.matched) and not len(graph.edges)):
+    if not len(graph.matched):
         return start
     pattern = _Pattern(graph)
     now, damping = start, energy.damping
