@@ -250,4 +250,4 @@ def _cross(vector: F64) -> F64:
 
 def _skew_square(cross_a: F64, cross_b: F64) -> F64:
     """`cross_a^T cross_b` (K, 3, 3)."""
-    return -np.einsum("eab,ebc->eac", cross_a, cross_b)
+    return np.asarray(-np.einsum("eab,ebc->eac", cross_a, cross_b))

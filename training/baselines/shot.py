@@ -120,7 +120,7 @@ def describe(support: Support, normals: F64, frames: F64) -> F32:
     histograms = out.reshape(total, LENGTH)
     histograms[support.count < FEWEST] = 0.0
     length = np.sqrt(np.einsum("kl,kl->k", histograms, histograms))
-    return (histograms / np.maximum(length, 1e-12)[:, None]).astype(np.float32)
+    return np.asarray((histograms / np.maximum(length, 1e-12)[:, None]).astype(np.float32))
 
 
 def shot(points: F64, normals: F64, keypoints: F64, radius_m: float) -> tuple[F64, F32]:
