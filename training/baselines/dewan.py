@@ -67,8 +67,9 @@ class DewanConfig:
     neighbours: int = 8  # of each vertex, at most
     reach_m: float = 1.2  # to neighbours on what stands
     voters: int = 16  # matches round a vertex that choose its start
+    for_standing: int = 0  # votes beforehand for the start that the laid over scans give
     agree_m: float = 0.4  # matches that the motion of a vertex misses by less bear it out
-    bear_out: int = 5  # as many have to, of the `voters` nearest
+    bear_out: int = 8  # as many have to, of the `voters` nearest
     bear_out_m: float = 4.0  # and no further away
     ground_reach_m: float = 8.0  # the same for the ground, which is one body
     still_m: float = 0.15  # the ground's motion is borne out by what stands and moves within so much of it
@@ -76,7 +77,9 @@ class DewanConfig:
 
 
 PAPER = DewanConfig()
-STRONG = replace(PAPER, name="dewan_strong", window_m=3.5, laid_over=True, upright=True, mutual=True, refined=2)
+STRONG = replace(
+    PAPER, name="dewan_strong", window_m=3.5, laid_over=True, upright=True, mutual=True, for_standing=3, refined=2
+)
 
 
 def dewan(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
@@ -274,7 +277,8 @@ def voted(xyz: F64, at: F64, shift: F64, config: DewanConfig) -> F64:
     _, near = cKDTree(at).query(xyz, np.arange(1, min(config.voters, len(at)) + 1))
     said = shift[near]
     agree = ((said[:, :, None] - said[:, None]) ** 2).sum(axis=3) < config.agree_m**2
-    most = agree.sum(axis=2).argmax(axis=1)
+    votes = agree.sum(axis=2) + config.for_standing * ((said**2).sum(axis=2) < config.agree_m**2)
+    most = votes.argmax(axis=1)
     chosen = agree[np.arange(len(xyz)), most]
     return np.asarray(np.einsum("vk,vka->va", chosen, said) / chosen.sum(axis=1)[:, None])
 
