@@ -11,7 +11,7 @@ from scored_pair import an_object, make_pair
 
 from augkitti.frames import pose_from_xyz_yaw, rigid, transform_points
 from training.baselines.dewan import (
-    PAPER,
+    PLAIN,
     best_matches,
     cell_means,
     dewan,
@@ -185,13 +185,13 @@ def test_matches_are_the_most_alike_within_the_largest_motion():
     xyz0, xyz1 = np.zeros((4, 3)), np.zeros((4, 3))
     xyz1[2, 0] = 50.0
     said[3] = 0.0
-    rows, targets = best_matches(xyz0, said, xyz1, said, PAPER)
+    rows, targets = best_matches(xyz0, said, xyz1, said, PLAIN)
     kept = dict(zip(rows.tolist(), targets.tolist(), strict=True))
     assert kept[0] == 0
     assert kept[1] == 1
     assert kept.get(2) != 2
     assert 3 not in kept
-    mutual, _ = best_matches(xyz0 + 9.0 * np.arange(4)[:, None], said, xyz1, said, replace(PAPER, mutual=True))
+    mutual, _ = best_matches(xyz0 + 9.0 * np.arange(4)[:, None], said, xyz1, said, replace(PLAIN, mutual=True))
     assert list(mutual) == [0]
 
 
@@ -239,7 +239,7 @@ def test_world_and_car_of_a_street_are_followed(name):
 def test_what_falls_in_the_same_cells_is_followed_exactly():
     step = pose_from_xyz_yaw(-0.6, 0.3, 0.0, 0.0)  # whole cells of surface, vertices and targets
     pair = street(np.random.default_rng(1), step, step)
-    said = scene_flow_of(pair, true_boxes(pair), replace(PAPER, vertex_m=0.3, target_m=0.3))
+    said = scene_flow_of(pair, true_boxes(pair), replace(PLAIN, vertex_m=0.3, target_m=0.3))
     car = pair.scan0.instance == 0
     assert said.where[car].mean() > 0.9
     off = np.linalg.norm(said.flows["dewan"] - pair.flow0, axis=1)[said.where]

@@ -2,20 +2,26 @@
 
 Dewan, Caselitz, Tipaldi, Burgard, "Rigid Scene Flow for 3D LiDAR Scans", IROS 2016, pooled over detections and
 background as PointFlowNet's section 4 has it ("Dewan et al. + Det."). What stands on the ground is thinned to vertices,
-which are matched by SHOT (`shot`); the ground, where descriptors tell nothing, gives vertices without a match; a factor
-graph (`rigid_scene_flow`) then gives every vertex a motion of its own.
+which are matched by SHOT (`shot`); a factor graph (`rigid_scene_flow`) gives every vertex a motion of its own. On the
+ground, where descriptors tell nothing, vertices take up the motion of what stands round them.
 
-An estimate counts where matches round a vertex bear its motion out; only points beside such a vertex have flow, that of
-the vertex. Their share is the coverage that `score` gives. Flow stays that of the points, also in boxes: pooled motions
-are the figures of objects and of ego-motion, and pooling them would hide what the method says. `dewan` does what the
-paper does, with descriptors in frames of their own, and matches anywhere within the largest motion; `dewan_strong` lays
-the scans over each other first (`augkitti.ego_motion.register`), so that matches are looked for within what things move
-over ground, describes in upright frames, asks matches to be mutual, and then draws the
-surfaces that the motions lay over each other together, point to plane.
+An estimate counts where half of the matches round a vertex bear its motion out; only points beside such a vertex have
+flow, that of the vertex. Their share is the coverage that `score` gives. Flow stays that of the points, also in boxes:
+pooled motions are the figures of objects and of ego-motion, and painting boxes with them would hide what the method
+says.
+
+`dewan` is the method plain: descriptors in frames of their own, matches anywhere within the largest motion, motions
+pooled by least squares. Its energy is the paper's; that each vertex starts from the motion most matches round it agree
+on, what counts as valid, all sizes, and the ground are ours, and better than what PointFlowNet's table shows.
+`dewan_strong` lays the scans over each other first (`augkitti.ego_motion.register`), so that matches are looked for
+within what things move over ground, and standing wins where few matches say otherwise; describes in upright frames;
+asks matches to be mutual; then draws the surfaces that the motions lay over each other together, point to plane; and
+pools by RANSAC.
 
 Defined results: without detections there are no motions of objects; an object with fewer than three points that have
-flow moves with the ego-motion; with nothing matched on the background the ego-motion is the start's (the identity,
-or registration in `dewan_strong`); two empty or bare scans have flow nowhere; nothing is ever NaN.
+flow moves with the ego-motion; where nothing on the background has flow the ego-motion is the start's (the identity;
+in `dewan_strong` registration, if both scans hold 20 points); an empty or bare scan has flow nowhere; scans that are
+the same stand still, but for what thinning shifts (centimetres in `dewan`); nothing is ever NaN.
 """
 
 from dataclasses import dataclass, field, replace
@@ -46,7 +52,7 @@ class Region:
 
 @dataclass(frozen=True)
 class DewanConfig:
-    """Sizes and thresholds; those of the paper's method."""
+    """Sizes and thresholds; without arguments those of the plain method."""
 
     name: str = "dewan"
     region: Region = Region()
@@ -76,15 +82,15 @@ class DewanConfig:
     beside_m: float = 0.6  # a point has the motion of the vertex that is no further away
 
 
-PAPER = DewanConfig()
+PLAIN = DewanConfig()
 STRONG = replace(
-    PAPER, name="dewan_strong", window_m=3.5, laid_over=True, upright=True, mutual=True, for_standing=3, refined=2
+    PLAIN, name="dewan_strong", window_m=3.5, laid_over=True, upright=True, mutual=True, for_standing=3, refined=2
 )
 
 
 def dewan(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
-    """As the paper has it: flow where matches bear it out, pooled by least squares over detections and background."""
-    return scene_flow_of(pair, detections, PAPER)
+    """As the paper has it, as far as the module says: per-point motions, pooled by least squares."""
+    return scene_flow_of(pair, detections, PLAIN)
 
 
 def dewan_strong(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
