@@ -30,7 +30,7 @@ class FpfhConfig:
 
 
 PLAIN = FpfhConfig()
-STRONG = FpfhConfig()
+STRONG = FpfhConfig(voxel_m=0.2, normal_m=0.6, feature_m=1.0)
 
 
 def fpfh(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:

@@ -1,8 +1,8 @@
 """Keypoints with features of two scans in, matches and their flow out: what FPFH and 3DMatch share.
 
 `by_points` is the paper's way: the nearest neighbour in feature space anywhere in scan 1, for every point the flow of
-the nearest keypoint, and motions fitted to it. `by_agreement` is the careful way: neighbours within a window, mutual ones
-only, and the motion that most matches agree on.
+the nearest keypoint, and motions fitted to it. `by_agreement` is the careful way: neighbours within a window and
+motions that most matches agree on.
 """
 
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from augkitti.config import GroundConfig
-from augkitti.frames import F32, F64, Array, compose, transform_points
+from augkitti.frames import F32, F64, Array, compose, pose_from_xyz_yaw, rigid, transform_points
 from augkitti.ground import fit_ground, standing_points
-from augkitti.scan_pair import I64, AugmentedPair
+from augkitti.scan_pair import I64, AugmentedPair, Bool
 from augkitti.seeds import generator
 from training.baselines.followed import FEWEST_POINTS, boxes_of, followed, object_points
 from training.baselines.rigid_fit import fit_rigid, ransac_rigid
-from training.metrics import rotation_error
 from training.predictions import Prediction
 
 _BLOCK = 1 << 22  # numbers of a block of distances between features
+_REFINEMENTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +36,15 @@ class Agreement:
     """How careful matching goes about it."""
 
     window_m: float = 3.0  # of the world: the ego car drives up to 2.5 m between scans
-    object_window_m: float = 4.0  # of objects, after the ego-motion: 40 m/s
-    world_within_m: float = 0.4  # matches agree with a motion to so much: keypoints of two scans lie side by side
-    within_m: float = 0.3
-    fewest: int = 4  # matches that agree on an object's motion; with fewer it moves with the world
+    within_m: float = 0.4  # matches agree to so much: keypoints of two scans do not lie on the same spots
     most: int = 3000  # matches that have a say in the world's motion
     draws: int = 1000
-    largest_turn_rad: float = 0.35  # of an object against the world, between scans
+    object_window_m: float = 4.0  # of objects, about where they would be if they stood: 40 m/s
+    object_best: int = 8  # matches of each of its keypoints that propose a shift
+    object_within_m: float = 0.35
+    fewest: int = 4  # keypoints that agree on an object's shift; with fewer it moves with the world
+    more_than_standing: float = 1.3  # times as many as agree that it stands
+    largest_turn_rad: float = 0.2  # of an object against the world, between scans
 
 
 def standing(xyz: F32) -> I64:
@@ -77,18 +79,7 @@ def mutual_within(xyz0: F64, feature0: F64, xyz1: F64, feature1: F64, window_m: 
         feature1: (K1, F).
         window_m: farthest that a match lies from where it is looked for.
     """
-    if not len(xyz0) or not len(xyz1):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    near = cKDTree(xyz0).sparse_distance_matrix(cKDTree(xyz1), window_m, output_type="ndarray")
-    order = np.lexsort((near["j"], near["i"]))  # of equally near ones the first
-    i, j = near["i"][order].astype(np.int64), near["j"][order].astype(np.int64)
-    step = max(1, _BLOCK // feature0.shape[1])
-    apart = np.concatenate(
-        [
-            ((feature0[i[k : k + step]] - feature1[j[k : k + step]]) ** 2).sum(axis=1)
-            for k in range(0, max(len(i), 1), step)
-        ]
-    )
+    i, j, apart = _within(xyz0, feature0, xyz1, feature1, window_m)
     least0, least1 = np.full(len(xyz0), np.inf), np.full(len(xyz1), np.inf)
     np.minimum.at(least0, i, apart)
     np.minimum.at(least1, j, apart)
@@ -96,6 +87,27 @@ def mutual_within(xyz0: F64, feature0: F64, xyz1: F64, feature1: F64, window_m: 
     i, j = i[mutual], j[mutual]
     _, first = np.unique(i, return_index=True)
     return i[first], j[first]
+
+
+def best_within(xyz0: F64, feature0: F64, xyz1: F64, feature1: F64, window_m: float, most: int) -> tuple[I64, I64]:
+    """The `most` nearest in feature space within a window of each keypoint; arguments as of `mutual_within`."""
+    i, j, apart = _within(xyz0, feature0, xyz1, feature1, window_m)
+    order = np.lexsort((apart, i))
+    i, j = i[order], j[order]
+    kept = np.arange(len(i)) - np.searchsorted(i, i) < most
+    return i[kept], j[kept]
+
+
+def _within(xyz0: F64, feature0: F64, xyz1: F64, feature1: F64, window_m: float) -> tuple[I64, I64, F64]:
+    """Rows of all pairs of keypoints within a window, and how far apart their features are (squared)."""
+    if not len(xyz0) or not len(xyz1):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    near = cKDTree(xyz0).sparse_distance_matrix(cKDTree(xyz1), window_m, output_type="ndarray")
+    order = np.lexsort((near["j"], near["i"]))  # of equally good ones the first, whatever the tree's order
+    i, j = near["i"][order].astype(np.int64), near["j"][order].astype(np.int64)
+    step = max(1, _BLOCK // feature0.shape[1])
+    parts = [((feature0[i[k : k + step]] - feature1[j[k : k + step]]) ** 2).sum(axis=1) for k in range(0, len(i), step)]
+    return i, j, np.concatenate([np.zeros(0), *parts])
 
 
 def by_points(
@@ -141,30 +153,75 @@ def by_agreement(
     on_object = np.zeros(len(first.xyz), dtype=bool)
     on_object[np.concatenate([np.zeros(0, np.int64), *rows])] = True
     ego = _world(first, second, ~on_object, rules, rng)
-    expected = transform_points(ego, first.xyz)
-    i, j = mutual_within(expected, first.feature, second.xyz, second.feature, rules.object_window_m)
     motions = []
     for mine, inside in zip(rows, points, strict=True):
-        kept = np.isin(i, mine)
-        few = len(inside) < FEWEST_POINTS
-        motions.append(ego if few else _object(expected[i[kept]], second.xyz[j[kept]], ego, rules, rng))
+        if len(inside) < FEWEST_POINTS:
+            motions.append(ego)
+            continue
+        expected = transform_points(ego, first.xyz[mine])
+        i, j = best_within(
+            expected, first.feature[mine], second.xyz, second.feature, rules.object_window_m, rules.object_best
+        )
+        motions.append(compose(_own_motion(expected, i, second.xyz[j], rules), ego))
     return followed(name, pair, ego, detections, motions)
 
 
-def _world(first: Keypoints, second: Keypoints, world: Array, rules: Agreement, rng: np.random.Generator) -> F64:
-    i, j = mutual_within(first.xyz[world], first.feature[world], second.xyz, second.feature, rules.window_m)
+def _world(first: Keypoints, second: Keypoints, world: Bool, rules: Agreement, rng: np.random.Generator) -> F64:
+    xyz0, feature0 = first.xyz[world], first.feature[world]
+    i, j = mutual_within(xyz0, feature0, second.xyz, second.feature, rules.window_m)
     if len(i) < FEWEST_POINTS:
         return np.eye(4)
     chosen = np.sort(rng.permutation(len(i))[: rules.most])
-    motion, _ = ransac_rigid(first.xyz[world][i[chosen]], second.xyz[j[chosen]], rules.world_within_m, rng, rules.draws)
-    return motion
+    return ransac_rigid(xyz0[i[chosen]], second.xyz[j[chosen]], rules.within_m, rng, rules.draws)[0]
 
 
-def _object(expected: F64, found: F64, ego: F64, rules: Agreement, rng: np.random.Generator) -> F64:
-    """Motion of an object whose matches lie at `found` (K, 3), were it to stand at `expected`; else the world's."""
-    if len(expected) < rules.fewest:
-        return ego
-    own, agree = ransac_rigid(expected, found, rules.within_m, rng, rules.draws)
-    if agree.sum() < rules.fewest or rotation_error(own, np.eye(4)) > rules.largest_turn_rad:
-        return ego
-    return compose(own, ego)
+def _own_motion(xyz0: F64, row: I64, found: F64, rules: Agreement) -> F64:
+    """How an object moves over ground, from what its keypoints (K, 3) may have become: none unless enough agree.
+
+    RANSAC with draws of one match, of which all are tried: each proposes its shift, and the one that most keypoints
+    agree on is refined. Draws of three, as for the world, would turn a car of few keypoints at will.
+
+    Args:
+        xyz0: (K, 3) keypoints, where they would be if it stood.
+        row: (M,) keypoint of each match.
+        found: (M, 3) the keypoint of scan 1.
+        rules: what is enough.
+    """
+    if not len(row):
+        return np.eye(4)
+    shift = found - xyz0[row]
+    tree = cKDTree(shift)
+    near = tree.sparse_distance_matrix(tree, rules.object_within_m, output_type="ndarray")
+    voter = np.unique(near["i"].astype(np.int64) * len(xyz0) + row[near["j"]])  # a keypoint has one voice
+    voices = np.bincount(voter // len(xyz0), minlength=len(shift))
+    standing_voices = len(np.unique(row[np.linalg.norm(shift, axis=1) < rules.object_within_m]))
+    best = int(voices.argmax())
+    if voices[best] < max(rules.fewest, rules.more_than_standing * standing_voices):
+        return np.eye(4)
+    own = rigid(np.eye(3), shift[best])
+    for _ in range(_REFINEMENTS):
+        off = np.linalg.norm(transform_points(own, xyz0)[row] - found, axis=1)
+        order = np.lexsort((off, row))  # of each keypoint the match that fits best
+        _, first = np.unique(row[order], return_index=True)
+        kept = order[first]
+        kept = kept[off[kept] < rules.object_within_m]
+        if len(kept) < rules.fewest:
+            break
+        own = upright_fit(xyz0[row[kept]], found[kept], rules.largest_turn_rad)
+    return own
+
+
+def upright_fit(xyz0: F64, xyz1: F64, largest_turn_rad: float) -> F64:
+    """The shift and turn about z (4, 4) that lay points (K, 3) on their partners with the least sum of squares.
+
+    A turn is believed where it is twice its own uncertainty and not larger than allowed; else a shift alone.
+    """
+    centre0, centre1 = xyz0.mean(axis=0), xyz1.mean(axis=0)
+    away0, away1 = xyz0[:, :2] - centre0[:2], xyz1[:, :2] - centre1[:2]
+    lever = float((away0 * away1).sum())
+    turn = float(np.arctan2((away0[:, 0] * away1[:, 1] - away0[:, 1] * away1[:, 0]).sum(), lever))
+    R = pose_from_xyz_yaw(0.0, 0.0, 0.0, turn)[:3, :3]
+    stray = float(np.sqrt(((away0 @ R[:2, :2].T - away1) ** 2).sum(axis=1).mean()))
+    if abs(turn) > largest_turn_rad or abs(turn) * np.sqrt(max(lever, 0.0)) < 2.0 * stray:
+        R = np.eye(3)
+    return rigid(R, centre1 - R @ centre0)
