@@ -73,7 +73,7 @@ def _open3d() -> Any:
     try:
         import libusb_package
 
-        ctypes.CDLL(libusb_package.get_library_path(), mode=ctypes.RTLD_GLOBAL)  # its wheel wants one, used or not
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)  # its wheel wants one, used or not
         import open3d
     except ImportError as err:
         raise InputError("open3d", "is not installed", "pip install 'augkitti[fit]'") from err
