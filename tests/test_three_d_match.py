@@ -29,8 +29,9 @@ from training.baselines.descriptor_network import (  # noqa: E402
 )
 from training.baselines.tdf import FieldConfig  # noqa: E402
 from training.baselines.three_d_match import (  # noqa: E402
-    STRONG,
-    described,
+    CONFIG,
+    keypoints,
+    scene_of,
     three_d_match,
     three_d_match_strong,
 )
@@ -136,6 +137,7 @@ def test_an_empty_background_and_empty_scans_stand(method):
 def test_a_scan_has_its_keypoints_within_seconds():
     scan = cast_pair(tick_step=1).pair.scan0
     start = time.perf_counter()
-    found = described(scan.xyz, load_network(shipped_network()), STRONG)
+    network = load_network(shipped_network())
+    found = keypoints(scene_of(scan.xyz, network), network, CONFIG.voxel_m, CONFIG.most)
     assert len(found.xyz) >= 1000
     assert time.perf_counter() - start < 8.0  # the second on two quiet cores; tests share theirs

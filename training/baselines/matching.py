@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from augkitti.config import GroundConfig
 from augkitti.frames import F32, F64, Array, compose, pose_from_xyz_yaw, rigid, transform_points
 from augkitti.ground import fit_ground, standing_points
-from augkitti.scan_pair import I64, AugmentedPair, Bool
+from augkitti.scan_pair import I64, AugmentedPair
 from augkitti.seeds import generator
 from training.baselines.followed import FEWEST_POINTS, boxes_of, followed, object_points
 from training.baselines.rigid_fit import fit_rigid, ransac_rigid
@@ -146,13 +146,31 @@ def by_agreement(
     A detection of under 3 points, or whose matches do not agree on a motion that a vehicle could make, moves with the
     world; a world of under 3 matches stands.
     """
-    rng = generator(0, pair.pair_id)
     boxes = boxes_of(detections)
+    ego = world_motion(pair, boxes, first, second, rules)
+    return followed(name, pair, ego, detections, object_motions(pair, boxes, first, second, ego, rules))
+
+
+def world_motion(pair: AugmentedPair, boxes: F64, first: Keypoints, second: Keypoints, rules: Agreement) -> F64:
+    """T_velo1_velo0 (4, 4) on which most mutual matches of keypoints outside of all boxes (n, 7) agree."""
+    inside = object_points(first.xyz.astype(np.float32), boxes)
+    world = np.ones(len(first.xyz), dtype=bool)
+    world[np.concatenate([np.zeros(0, np.int64), *inside])] = False
+    xyz0, feature0 = first.xyz[world], first.feature[world]
+    i, j = mutual_within(xyz0, feature0, second.xyz, second.feature, rules.window_m)
+    if len(i) < FEWEST_POINTS:
+        return np.eye(4)
+    rng = generator(0, pair.pair_id)
+    chosen = np.sort(rng.permutation(len(i))[: rules.most])
+    return ransac_rigid(xyz0[i[chosen]], second.xyz[j[chosen]], rules.within_m, rng, rules.draws)[0]
+
+
+def object_motions(
+    pair: AugmentedPair, boxes: F64, first: Keypoints, second: Keypoints, ego: F64, rules: Agreement
+) -> list[F64]:
+    """Motion (4, 4) from velo0 to velo1 of each box (n, 7): the world's and its own, on which its keypoints agree."""
     points = object_points(pair.scan0.xyz, boxes)
     rows = object_points(first.xyz.astype(np.float32), boxes)
-    on_object = np.zeros(len(first.xyz), dtype=bool)
-    on_object[np.concatenate([np.zeros(0, np.int64), *rows])] = True
-    ego = _world(first, second, ~on_object, rules, rng)
     motions = []
     for mine, inside in zip(rows, points, strict=True):
         if len(inside) < FEWEST_POINTS:
@@ -163,16 +181,7 @@ def by_agreement(
             expected, first.feature[mine], second.xyz, second.feature, rules.object_window_m, rules.object_best
         )
         motions.append(compose(_own_motion(expected, i, second.xyz[j], rules), ego))
-    return followed(name, pair, ego, detections, motions)
-
-
-def _world(first: Keypoints, second: Keypoints, world: Bool, rules: Agreement, rng: np.random.Generator) -> F64:
-    xyz0, feature0 = first.xyz[world], first.feature[world]
-    i, j = mutual_within(xyz0, feature0, second.xyz, second.feature, rules.window_m)
-    if len(i) < FEWEST_POINTS:
-        return np.eye(4)
-    chosen = np.sort(rng.permutation(len(i))[: rules.most])
-    return ransac_rigid(xyz0[i[chosen]], second.xyz[j[chosen]], rules.within_m, rng, rules.draws)[0]
+    return motions
 
 
 def _own_motion(xyz0: F64, row: I64, found: F64, rules: Agreement) -> F64:

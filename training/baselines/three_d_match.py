@@ -12,11 +12,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from augkitti.frames import F32, F64
+from augkitti.frames import F32, F64, transform_points
 from augkitti.scan_pair import I64, AugmentedPair, Bool
-from training.baselines.followed import boxes_of
-from training.baselines.matching import Agreement, Keypoints, by_agreement, by_points, one_a_voxel, standing
-from training.baselines.tdf import distance_field, in_reach, patches
+from training.baselines.followed import boxes_of, followed
+from training.baselines.matching import (
+    Agreement,
+    Keypoints,
+    by_points,
+    object_motions,
+    one_a_voxel,
+    standing,
+    world_motion,
+)
+from training.baselines.tdf import Field, distance_field, in_reach, patches
 from training.predictions import Prediction
 
 if TYPE_CHECKING:
@@ -28,12 +36,12 @@ class KeypointConfig:
     """Where descriptors are computed."""
 
     voxel_m: float = 0.6  # a keypoint each
-    dense_voxel_m: float | None = None  # the same near detections
-    most: int = 2500  # the nearest to the scanner, of either kind
+    most: int = 2500  # the nearest to the scanner
+    object_voxel_m: float = 0.3  # the same in boxes, and in scan 1 where they may have gone
+    box_reach_m: float = 3.0  # from its centre a detection's points are looked for
 
 
-PLAIN = KeypointConfig()
-STRONG = KeypointConfig(dense_voxel_m=0.3)
+CONFIG = KeypointConfig()
 AGREEMENT = Agreement()
 
 
@@ -51,7 +59,10 @@ def three_d_match(
         network: other than the shipped one.
     """
     network = _shipped() if network is None else network
-    first, second = (described(scan.xyz, network, PLAIN) for scan in (pair.scan0, pair.scan1))
+    first, second = (
+        keypoints(scene_of(scan.xyz, network), network, CONFIG.voxel_m, CONFIG.most)
+        for scan in (pair.scan0, pair.scan1)
+    )
     return by_points("3dmatch", pair, detections, first, second)
 
 
@@ -69,48 +80,63 @@ def three_d_match_strong(
         network: other than the shipped one.
     """
     network = _shipped() if network is None else network
+    scene0, scene1 = (scene_of(scan.xyz, network) for scan in (pair.scan0, pair.scan1))
+    first, second = (keypoints(scene, network, CONFIG.voxel_m, CONFIG.most) for scene in (scene0, scene1))
     boxes = boxes_of(detections)
-    first = described(pair.scan0.xyz, network, STRONG, boxes)
-    second = described(pair.scan1.xyz, network, STRONG, boxes, AGREEMENT.window_m + AGREEMENT.object_window_m)
-    return by_agreement("3dmatch_strong", pair, detections, first, second, AGREEMENT)
+    ego = world_motion(pair, boxes, first, second, AGREEMENT)
+    on = keypoints(scene0, network, CONFIG.object_voxel_m, CONFIG.most, boxes[:, :2], CONFIG.box_reach_m)
+    there = transform_points(ego, boxes[:, :3])[:, :2]
+    reach = CONFIG.box_reach_m + AGREEMENT.object_window_m
+    after = keypoints(scene1, network, CONFIG.object_voxel_m, CONFIG.most, there, reach)
+    motions = object_motions(pair, boxes, on, after, ego, AGREEMENT)
+    return followed("3dmatch_strong", pair, ego, detections, motions)
 
 
-def described(
-    xyz: F32, network: "DescriptorNetwork", config: KeypointConfig, boxes: F64 | None = None, farther_m: float = 0.0
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scan with all that descriptors are made of."""
+
+    xyz: F32  # (N, 3)
+    upright: I64  # (M,) rows of points that stand on the ground, in reach of the field
+    field: Field
+
+
+def scene_of(xyz: F32, network: "DescriptorNetwork") -> Scene:
+    """The scene of a scan (N, 3)."""
+    config = network.config.field
+    upright = standing(xyz)
+    return Scene(xyz, upright[in_reach(xyz[upright], config)], distance_field(xyz, config))
+
+
+def keypoints(
+    scene: Scene, network: "DescriptorNetwork", voxel_m: float, most: int, near: F64 | None = None, reach_m: float = 0.0
 ) -> Keypoints:
-    """Keypoints of a scan with their descriptors.
+    """Keypoints of a scene with their descriptors.
 
     Args:
-        xyz: (N, 3) points, velo.
+        scene: of the scan.
         network: of the descriptors.
-        config: where they are computed.
-        boxes: (n, 7) near which keypoints are dense.
-        farther_m: so far from the boxes, too.
+        voxel_m: a keypoint each.
+        most: of all, those nearest to the scanner.
+        near: (n, 2) where they are wanted; everywhere if not given.
+        reach_m: from there.
     """
     from training.baselines.descriptor_network import describe
 
-    field = network.config.field
-    upright = standing(xyz)
-    upright = upright[in_reach(xyz[upright], field)]
-    sparse = _nearest(xyz, one_a_voxel(xyz, config.voxel_m, upright), config.most)
-    rows = [sparse]
-    if config.dense_voxel_m is not None and boxes is not None:
-        near = upright[_is_near(xyz[upright], boxes, farther_m)]
-        rows.append(_nearest(xyz, one_a_voxel(xyz, config.dense_voxel_m, near), config.most))
-    place = xyz[np.unique(np.concatenate(rows))].astype(np.float64)
-    return Keypoints(place, describe(network, patches(distance_field(xyz, field), place, field.patch)))
+    rows = scene.upright
+    if near is not None:
+        rows = rows[_is_near(scene.xyz[rows], near, reach_m)]
+    rows = one_a_voxel(scene.xyz, voxel_m, rows)
+    rows = np.sort(rows[np.argsort((scene.xyz[rows, :2] ** 2).sum(axis=1), kind="stable")[:most]])
+    place = scene.xyz[rows].astype(np.float64)
+    return Keypoints(place, describe(network, patches(scene.field, place, network.config.field.patch)))
 
 
-def _nearest(xyz: F32, rows: I64, most: int) -> I64:
-    """Of some rows of points (N, 3) those nearest to the scanner."""
-    return rows[np.argsort((xyz[rows, :2] ** 2).sum(axis=1), kind="stable")[:most]]
-
-
-def _is_near(xyz: F32, boxes: F64, farther_m: float) -> Bool:
-    """Which points (N, 3) stand within a circle round any box (n, 7), or so much farther off."""
+def _is_near(xyz: F32, places: F64, reach_m: float) -> Bool:
+    """Which points (N, 3), seen from above, lie within reach of any of few places (n, 2)."""
     near = np.zeros(len(xyz), dtype=bool)
-    for x, y, _, length, width, _, _ in boxes:
-        near |= np.hypot(xyz[:, 0] - x, xyz[:, 1] - y) < 0.5 * np.hypot(length, width) + farther_m
+    for x, y in places[:, :2]:
+        near |= np.hypot(xyz[:, 0] - x, xyz[:, 1] - y) < reach_m
     return near
 
 
