@@ -158,6 +158,37 @@ def evaluate(
 
 
 @app.command()
+def tables(
+    data: Annotated[Path, typer.Option("--data", metavar="DIR", help="Augmented data set (AK), split.")],
+    kitti_data: Annotated[Path, typer.Option("--kitti-data", metavar="DIR", help="Plain data set (K), split alike.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for index.html, tables.tex, tables.json, figures.")],
+    k_runs: Annotated[
+        list[Path] | None,
+        typer.Option("--runs", metavar="K K_AK", help="A run trained on K and one trained on both; repeat for seeds."),
+    ] = None,
+    k_ak_runs: Annotated[
+        list[Path] | None, typer.Argument(metavar="[K_AK]...", help="Runs trained on both. Without: the shipped one.")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Pairs of each set and split, spread over it.")] = None,
+    boxes: Annotated[Literal["truth", "network"], typer.Option(help="Whose boxes the baselines follow.")] = "network",
+    threads: Threads = None,
+    device: Device = "auto",
+    precision: Precision = "auto",
+) -> None:
+    """Tables 1 and 2 of the paper and its figures as one HTML page, LaTeX and JSON."""
+    with _answers():
+        from training.tables import TablesOptions
+        from training.tables import tables as make
+
+        make(
+            TablesOptions(
+                data=data, kitti_data=kitti_data, out=out, k_runs=tuple(k_runs or ()), k_ak_runs=tuple(k_ak_runs or ()),
+                limit=limit, boxes=boxes, threads=threads, device=device, precision=precision,
+            )
+        )  # fmt: skip
+
+
+@app.command()
 def predict(
     scan0: Annotated[Path, typer.Argument(help="First scan: .bin (KITTI), .npy, .pcd or .ply.")],
     scan1: Annotated[Path, typer.Argument(help="Next scan.")],
