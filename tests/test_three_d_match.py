@@ -134,10 +134,10 @@ def test_an_empty_background_and_empty_scans_stand(method):
     np.testing.assert_array_equal(said.ego_motion, np.eye(4))
 
 
-def test_a_scan_has_its_keypoints_within_seconds():
+def test_a_scan_has_its_thousand_keypoints_within_four_seconds_of_two_cores():
     scan = cast_pair(tick_step=1).pair.scan0
-    start = time.perf_counter()
+    start = time.process_time()
     network = load_network(shipped_network())
     found = keypoints(scene_of(scan.xyz, network), network, CONFIG.voxel_m, CONFIG.most)
     assert len(found.xyz) >= 1000
-    assert time.perf_counter() - start < 8.0  # the second on two quiet cores; tests share theirs
+    assert time.process_time() - start < 8.0  # of one core, whatever else runs

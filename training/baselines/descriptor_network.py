@@ -89,7 +89,7 @@ def describe(network: DescriptorNetwork, patch: F32) -> F64:
     if not len(patch):
         return np.zeros((0, network.config.feature))
     with torch.inference_mode():
-        parts = [network(part) for part in torch.split(torch.from_numpy(patch), _AT_ONCE)]  # type: ignore[no-untyped-call]
+        parts = [network(part) for part in torch.split(torch.from_numpy(patch), _AT_ONCE)]
     return np.asarray(torch.cat(parts).numpy(), dtype=np.float64)
 
 

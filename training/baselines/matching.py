@@ -21,6 +21,7 @@ from training.predictions import Prediction
 
 _BLOCK = 1 << 22  # numbers of a block of distances between features
 _REFINEMENTS = 3
+_MOST_POINTS = 3000  # that have a say in a motion that most agree on
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +112,25 @@ def _within(xyz0: F64, feature0: F64, xyz1: F64, feature1: F64, window_m: float)
 
 
 def by_points(
-    name: str, pair: AugmentedPair, detections: Prediction | None, first: Keypoints, second: Keypoints
+    name: str,
+    pair: AugmentedPair,
+    detections: Prediction | None,
+    first: Keypoints,
+    second: Keypoints,
+    within_m: float | None = None,
 ) -> Prediction:
     """Motions from a flow of every point, which is that of its nearest keypoint.
 
     A detection of under 3 points moves with the world; a world of under 3 points stands, and so does all where a scan
     has no keypoints.
+
+    Args:
+        name: of the flow.
+        pair: the scans.
+        detections: whose boxes are followed.
+        first: keypoints of scan 0.
+        second: of scan 1.
+        within_m: motions are those that most points agree on to so much (RANSAC); least squares over all if not given.
     """
     xyz0 = pair.scan0.xyz
     boxes = boxes_of(detections)
@@ -128,9 +142,16 @@ def by_points(
     end = start + flow[cKDTree(first.xyz).query(start)[1]]
     world = np.ones(len(start), dtype=bool)
     world[np.concatenate([np.zeros(0, np.int64), *rows])] = False
-    ego = fit_rigid(start[world], end[world]) if world.sum() >= FEWEST_POINTS else np.eye(4)
-    motions = [fit_rigid(start[mine], end[mine]) if len(mine) >= FEWEST_POINTS else ego for mine in rows]
-    return followed(name, pair, ego, detections, motions)
+    rng = generator(0, pair.pair_id)
+
+    def fit(mine: I64) -> F64:
+        if within_m is None:
+            return fit_rigid(start[mine], end[mine])
+        mine = rng.permutation(mine)[:_MOST_POINTS]
+        return ransac_rigid(start[mine], end[mine], within_m, rng)[0]
+
+    ego = fit(np.flatnonzero(world)) if world.sum() >= FEWEST_POINTS else np.eye(4)
+    return followed(name, pair, ego, detections, [fit(mine) if len(mine) >= FEWEST_POINTS else ego for mine in rows])
 
 
 def by_agreement(

@@ -2,8 +2,9 @@
 
 Keypoints, one a voxel, of what stands on the ground; about each a patch of the scan's truncated distance field, and of
 each patch a descriptor by a network (`descriptor_network`): by default the small one that comes with the program.
-Matching and motions are FPFH's (`matching`): `three_d_match` the paper's way, `three_d_match_strong` with care, and
-with denser keypoints where detections are and may go. Needs torch (extra `train`), imported when called.
+Matching and motions are FPFH's (`matching`): `three_d_match` takes the nearest descriptor anywhere in scan 1 and fits
+motions by RANSAC, as 3DMatch's own registration does; `three_d_match_strong` goes about it with care, and with denser
+keypoints where detections are and may go. Needs torch (extra `train`), imported when called.
 """
 
 from dataclasses import dataclass
@@ -43,6 +44,7 @@ class KeypointConfig:
 
 CONFIG = KeypointConfig()
 AGREEMENT = Agreement()
+WITHIN_M = 0.5  # points agree with a motion to so much: keypoints lie side by side
 
 
 def three_d_match(
@@ -63,7 +65,7 @@ def three_d_match(
         keypoints(scene_of(scan.xyz, network), network, CONFIG.voxel_m, CONFIG.most)
         for scan in (pair.scan0, pair.scan1)
     )
-    return by_points("3dmatch", pair, detections, first, second)
+    return by_points("3dmatch", pair, detections, first, second, WITHIN_M)
 
 
 def three_d_match_strong(
