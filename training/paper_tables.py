@@ -249,14 +249,14 @@ def latex_of(rows: Sequence[Row], captions: tuple[str, str]) -> str:
 
 def _ablation_latex(rows: Sequence[Row], caption: str) -> str:
     lines = ablation_lines(rows)
-    body = _latex_lines(lines, [[_tex(line.trained_on or _NONE)] for line in lines], [[] for _ in lines], 9)
+    body = _latex_lines(lines, [[latex_text(line.trained_on or _NONE)] for line in lines], [[] for _ in lines], 9)
     head = _latex_head((("Eval.", "Dataset"), ("Training", "Dataset")), ())
     return _latex_table("c" * 9, head, body, caption, "tab:ablation")
 
 
 def _comparison_latex(rows: Sequence[Row], caption: str) -> str:
     lines = lines_of(rows, 2)
-    names = [[_tex(line.label) + ("" if line.whole else f" ({line.rows[0]['pairs']} pairs)")] for line in lines]
+    names = [[latex_text(line.label) + ("" if line.whole else f" ({line.rows[0]['pairs']} pairs)")] for line in lines]
     times = [[_latex_seconds(line)] for line in lines]
     head = _latex_head((("Eval.", "Dataset"), ("Method", "")), (("Time", "(s)"),))
     return _latex_table("cc*{7}cc", head, _latex_lines(lines, names, times, 10), caption, "tab:results")
@@ -310,7 +310,8 @@ def _latex_table(columns: str, head: str, body: str, caption: str, label: str) -
     )
 
 
-def _tex(text: str) -> str:
+def latex_text(text: str) -> str:
+    """With what LaTeX would take for commands written as signs."""
     for sign in "&%#_":
         text = text.replace(sign, "\\" + sign)
     return text

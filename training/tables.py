@@ -71,6 +71,9 @@ def tables(options: TablesOptions, compared: Sequence[Compared] = COMPARED) -> R
     """
     if options.threads:
         torch.set_num_threads(options.threads)
+    if options.k_runs and len(options.k_runs) != len(options.k_ak_runs):
+        counts = f"{len(options.k_runs)} runs trained on K, {len(options.k_ak_runs)} on K and AK"
+        raise InputError("--runs", counts, "name a K+AK run behind each: --runs runs/k runs/k_ak")
     if find_spec("matplotlib") is None:
         raise InputError("matplotlib", "is not installed", "pip install 'augkitti[view]'")
     sets = PaperSets(options.kitti_data, options.data, options.limit)
@@ -81,15 +84,11 @@ def tables(options: TablesOptions, compared: Sequence[Compared] = COMPARED) -> R
         found.about.update(_about(options, runs, team))
         _print_tables(found.rows)
         again = Again(sets, runs, compared, options.boxes, found.rules)
+        content = json.dumps(_finite(found.as_json()), indent=1, allow_nan=False) + "\n"
+        _write(options.out / "tables.json", content)  # before the figures: minutes of scoring are safe then
+        _write(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
         pictures = draw_all(options.out / "figures", found, again, runs[-1].predictor.network, options.fig3b)
-    try:
-        write_text(options.out / "tables.json", json.dumps(_finite(found.as_json()), indent=1, allow_nan=False) + "\n")
-        write_text(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
-        write_text(options.out / "index.html", page_of(found, pictures))
-    except OSError as err:
-        raise MachineError(
-            options.out, f"cannot be written ({err.strerror})", "free space, or give another --out"
-        ) from err
+    _write(options.out / "index.html", page_of(found, pictures))
     print(f"{options.out / 'index.html'}: tables and {len(pictures)} figures; tables.tex and tables.json beside it")
     return found
 
@@ -118,6 +117,13 @@ def _processor() -> str:
         lines = []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return named[0] if named else platform.processor() or platform.machine()
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        write_text(path, text)
+    except OSError as err:
+        raise MachineError(path, f"cannot be written ({err.strerror})", "free space, or give another --out") from err
 
 
 def _make_folder(folder: Path) -> None:

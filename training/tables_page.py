@@ -12,6 +12,7 @@ from training.paper_tables import (
     ablation_html,
     ablation_lines,
     comparison_html,
+    latex_text,
     lines_of,
     ways_html,
 )
@@ -111,7 +112,7 @@ def verdicts(found: Results) -> list[str]:
 def captions_of(found: Results) -> tuple[str, str]:
     """Of the two LaTeX tables."""
     data = found.about["data"]
-    names = f"K: \\texttt{{{_tex(data['K'])}}}, AK: \\texttt{{{_tex(data['AK'])}}}"
+    names = f"K: \\texttt{{{latex_text(data['K'])}}}, AK: \\texttt{{{latex_text(data['AK'])}}}"
     return (
         f"{{\\bf Ablation Study}} on our validation splits ({names}). In grey: the paper's figures.",
         f"{{\\bf Comparison to Baselines}} on our test splits ({names}). In grey: the paper's figures.",
@@ -203,7 +204,3 @@ def _machine_text(found: Results) -> str:
 def _fg(line: Line | None) -> float | None:
     one = None if line is None else line.figure("fg_epe")
     return None if one is None else one.mean
-
-
-def _tex(text: str) -> str:
-    return text.replace("_", "\\_")
