@@ -47,13 +47,14 @@ def place(tmp_path_factory):
     return folder
 
 
+def draw_a_pixel(folder, *_):
+    (folder / "one.png").write_bytes(PIXEL)
+    return [Picture(folder / "one.png", "One <picture>", "Of a pixel.")]
+
+
 @pytest.fixture
 def without_figures(monkeypatch):
-    def draw(folder, *_):
-        (folder / "one.png").write_bytes(PIXEL)
-        return [Picture(folder / "one.png", "One <picture>", "Of a pixel.")]
-
-    monkeypatch.setattr(module, "draw_all", draw)
+    monkeypatch.setattr(module, "draw_all", draw_a_pixel)
 
 
 def options(place, out, **changes):
@@ -69,7 +70,7 @@ def made(place, tmp_path_factory):
     """Folder and results with a method of few pairs, and two seeds of K+AK."""
     out = tmp_path_factory.mktemp("out") / "report"
     with pytest.MonkeyPatch.context() as patch:
-        without_figures.__wrapped__(patch)
+        patch.setattr(module, "draw_all", draw_a_pixel)
         return out, tables(options(place, out), (*COMPARED, LATE))
 
 

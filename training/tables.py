@@ -71,7 +71,7 @@ def tables(options: TablesOptions, compared: Sequence[Compared] = COMPARED) -> R
     """
     if options.threads:
         torch.set_num_threads(options.threads)
-    if options.k_runs and len(options.k_runs) != len(options.k_ak_runs):
+    if len(options.k_ak_runs) < len(options.k_runs):
         counts = f"{len(options.k_runs)} runs trained on K, {len(options.k_ak_runs)} on K and AK"
         raise InputError("--runs", counts, "name a K+AK run behind each: --runs runs/k runs/k_ak")
     if find_spec("matplotlib") is None:
