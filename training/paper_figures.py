@@ -53,7 +53,7 @@ def draw_all(
     rivals = best_baselines(found.rows)
     if ranked:
         out.append(_zoom(folder, again, ranked, rivals[:1]))
-        chosen = dict.fromkeys(ranked[int(share * (len(ranked) - 1))] for share in SCENES)
+        chosen = dict.fromkeys(ranked[int(share * len(ranked))] for share in SCENES)
         out += [_comparison(folder, k, name, again, rivals) for k, name in enumerate(chosen, start=1)]
     seen = [one for one in found.close if one.points >= _FEWEST_POINTS]
     out += [_failure(folder, k, one.pair_id, again) for k, one in enumerate(seen[:FAILURES], start=1)]
