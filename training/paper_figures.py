@@ -190,7 +190,7 @@ def _failure(folder: Path, number: int, name: str, again: Again) -> Picture:
     """Cars close to each other, as they are and as the network has them."""
     pair, said = again(name)
     truth = truth_of(pair, again.rules)
-    rows = np.flatnonzero(truth.close & truth.counts)
+    rows = np.flatnonzero(truth.close & truth.judged)
     error = np.linalg.norm(whole_flow(pair, said[OURS], OURS)[truth.rows] - truth.flow, axis=1)
     worst = max(rows, key=lambda row: float(error[truth.object == row].sum()))
     x, y = truth.boxes[worst, :2]
@@ -345,7 +345,7 @@ def _points_chart(folder: Path, found: Results) -> Picture:
                     )
             cars = (f"{name}\n{bins[k]['objects']:,}" for name, k in zip(names, used, strict=True))
             axes.set_xticks(range(len(used)), list(cars), fontsize=8)
-            axes.set_yscale("log")
+            _log_scale(axes)
             axes.set_xlabel("points on the car; cars to find, in all")
             axes.set_title(title, fontsize=11, loc="left")
             axes.grid(alpha=0.3)
@@ -359,6 +359,16 @@ def _points_chart(folder: Path, found: Results) -> Picture:
         "the mean over points and as much as any other in the mean over cars. Right: cars found, for methods that "
         "follow them.",
     )
+
+
+def _log_scale(axes: Any) -> None:
+    """With figures that are read without counting powers."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _cycled(count: int) -> list[str]:
