@@ -11,7 +11,7 @@ from pair_factory import make_pair  # noqa: E402
 from PIL import Image  # noqa: E402
 from scored_pair import SETTINGS, a_data_set, a_run, an_object, right  # noqa: E402
 from scored_pair import make_pair as hand_made  # noqa: E402
-from test_tables import options  # noqa: E402
+from test_tables import QUICK, options  # noqa: E402
 from tiny_network import tiny_settings  # noqa: E402
 
 import training.paper_figures as module  # noqa: E402
@@ -20,7 +20,7 @@ from training.network import PointFlowNet  # noqa: E402
 from training.network_figure import draw_network, network_stages  # noqa: E402
 from training.paper_scores import _close_cars  # noqa: E402
 from training.score import Rules  # noqa: E402
-from training.tables import COMPARED, tables  # noqa: E402
+from training.tables import tables  # noqa: E402
 
 
 def test_the_diagrams_parameters_are_all_of_the_networks():
@@ -81,7 +81,7 @@ def test_every_figure_that_the_data_can_give_is_drawn(tmp_path, monkeypatch):
         a_run(tmp_path / name, seed=seed)
     monkeypatch.setattr(module, "find_example", lambda pair: None)  # a few hundred points are no street
     out = tmp_path / "report"
-    tables(options(tmp_path, out, fig3b=(1, 1)), COMPARED)
+    tables(options(tmp_path, out, fig3b=(1, 1)), QUICK)
     made = {path.stem for path in (out / "figures").iterdir()}
     assert made == {"network", "fig3b", "points", "zoom", "comparison1", "comparison2"}  # no cars close to each other
     assert (out / "index.html").read_text().count("data:image/png;base64,") == len(made)

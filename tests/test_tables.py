@@ -19,6 +19,7 @@ from training.baselines.followed import boxes_of, followed  # noqa: E402
 from training.cli import app  # noqa: E402
 from training.paper_figures import Picture  # noqa: E402
 from training.paper_scores import Compared, best_baselines, spread_over  # noqa: E402
+from training.paper_tables import PAPER  # noqa: E402
 from training.tables import COMPARED, TablesOptions, tables  # noqa: E402
 
 OFF_M = 0.3
@@ -33,6 +34,7 @@ def a_little_off(pair, detections=None):
     return followed("late", pair, pair.ego_motion, detections, motions)
 
 
+QUICK = tuple(one for one in COMPARED if one.name in ("zero", "ego_true", "ego_registration"))
 LATE = Compared("late", "Late+Det.", a_little_off, paper="ICP+Det.", most_pairs=1)
 
 
@@ -55,6 +57,7 @@ def draw_a_pixel(folder, *_):
 @pytest.fixture
 def without_figures(monkeypatch):
     monkeypatch.setattr(module, "draw_all", draw_a_pixel)
+    monkeypatch.setattr(module, "COMPARED", QUICK)
 
 
 def options(place, out, **changes):
@@ -71,7 +74,7 @@ def made(place, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "report"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "draw_all", draw_a_pixel)
-        return out, tables(options(place, out), (*COMPARED, LATE))
+        return out, tables(options(place, out), (*QUICK, LATE))
 
 
 def rows_of(made, **wanted):
@@ -229,6 +232,15 @@ def test_bad_input_is_told_in_one_line(place, tmp_path, without_figures):
     assert "another grid" in refused("--runs", place / "k0", tmp_path / "wider", *words, *out)
     (tmp_path / "file").write_text("")
     assert "cannot be made" in refused(*runs, *words, "--out", tmp_path / "file")
+
+
+def test_what_is_compared_has_names_of_its_own_and_lines_of_the_paper_that_there_are():
+    names = [one.name for one in COMPARED]
+    assert len(set(names)) == len(names) == len({one.label for one in COMPARED})
+    printed = {one.method for one in PAPER if one.table == 2}
+    assert {one.paper for one in COMPARED if one.paper is not None} <= printed
+    for one in COMPARED:
+        assert one.paper in (None, one.label)
 
 
 def test_pairs_are_spread_over_a_set():

@@ -62,13 +62,18 @@ class TablesOptions:
     fig3b: tuple[int, int] = (2, 200)  # seeds and steps a network
 
 
-def tables(options: TablesOptions, compared: Sequence[Compared] = COMPARED) -> Results:
+def tables(options: TablesOptions, compared: Sequence[Compared] | None = None) -> Results:
     """The command: `index.html`, `tables.tex`, `tables.json` and `figures/` in a folder.
+
+    Args:
+        options: what is asked for.
+        compared: what stands beside the network; `COMPARED` where not given.
 
     Raises:
         InputError: data sets without the splits, or without pairs in them; runs that are none or do not fit each other.
         MachineError: the disk refused.
     """
+    compared = COMPARED if compared is None else compared
     if options.threads:
         torch.set_num_threads(options.threads)
     if len(options.k_ak_runs) < len(options.k_runs):
