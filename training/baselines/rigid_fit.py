@@ -1,13 +1,16 @@
 """Matched points in, the rigid motion between them out: what every baseline ends with.
 
 `fit_rigid` is the least-squares fit by singular values (Kabsch); `ransac_rigid` finds the motion that most matches
-agree on, for matches many of which are wrong.
+agree on, for matches many of which are wrong; `closest_points` (ICP) finds matches and motion in turn.
 """
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from augkitti.frames import F64, rigid, transform_points
 from augkitti.scan_pair import Bool
+
+_STILL_M = 1e-4  # an iteration of ICP that moves points less is the last
 
 
 def fit_rigid(xyz0: F64, xyz1: F64, weight: F64 | None = None) -> F64:
@@ -58,6 +61,35 @@ def ransac_rigid(xyz0: F64, xyz1: F64, within_m: float, rng: np.random.Generator
     motion = fit_rigid(xyz0[inlier], xyz1[inlier])
     again = _agree(motion, xyz0, xyz1, within_m)
     return (fit_rigid(xyz0[again], xyz1[again]), again) if again.sum() >= inlier.sum() else (motion, inlier)
+
+
+def closest_points(
+    xyz0: F64, tree1: cKDTree, start: F64 | None = None, within_m: float = np.inf, iterations: int = 30
+) -> F64:
+    """The motion (4, 4) of points (K, 3) onto those in a tree by point-to-point ICP (Besl and McKay 1992).
+
+    Args:
+        xyz0: metres.
+        tree1: of points (M, 3).
+        start: motion to begin with; none where not given.
+        within_m: a point whose nearest one is farther does not count.
+        iterations: the most; it ends when points move less than a tenth of a millimetre, or under three count.
+    """
+    motion = np.eye(4) if start is None else start
+    if not tree1.n or not len(xyz0):
+        return motion
+    moved = transform_points(motion, xyz0)
+    for _ in range(iterations):
+        before = moved
+        distance, nearest = tree1.query(moved, distance_upper_bound=within_m)
+        met = np.isfinite(distance)
+        if met.sum() < 3:
+            break
+        motion = fit_rigid(xyz0[met], tree1.data[nearest[met]])
+        moved = transform_points(motion, xyz0)
+        if np.abs(moved - before).max() < _STILL_M:
+            break
+    return motion
 
 
 def _agree(motion: F64, xyz0: F64, xyz1: F64, within_m: float) -> Bool:

@@ -1,0 +1,109 @@
+"""FPFH + Det."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matched_scene import BOX, EGO, corner_and_box, of_points, spaced
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scored_pair import an_object, make_pair
+
+from augkitti.frames import is_rigid
+from training.baselines.followed import true_boxes
+from training.metrics import rotation_error, translation_error
+
+pytest.importorskip("open3d")
+
+from training.baselines.fpfh import STRONG, fpfh, fpfh_keypoints, fpfh_strong
+
+BOTH = pytest.mark.parametrize("method", [fpfh, fpfh_strong], ids=["plain", "strong"])
+FINE = replace(STRONG, voxel_m=0.08)  # so that every point has neighbours enough for a normal
+
+
+def rough_wall(rng):
+    """Points of a curved surface in front of the scanner, no two in a voxel of `FINE` however it is turned."""
+    y, z = spaced(rng, [-2.0, -1.5, 0.0], [2.0, 1.5, 1e-9], 0.15, 1500).T[:2]
+    return np.column_stack([8.0 + 0.5 * np.sin(1.3 * y) + 0.4 * np.cos(2.1 * z), y, z])
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=8, deadline=None)
+def test_histograms_do_not_change_when_a_scan_turns_about_the_scanner(seed):
+    rng = np.random.default_rng(seed)
+    xyz = rough_wall(rng)
+    R = Rotation.random(random_state=seed).as_matrix()
+    one, other = fpfh_keypoints(xyz, FINE), fpfh_keypoints(xyz @ R.T, FINE)
+    assert len(one.xyz) == len(other.xyz) == len(xyz)
+    distance, partner = cKDTree(other.xyz).query(one.xyz @ R.T)
+    assert distance.max() < 1e-9
+    same = np.abs(one.feature - other.feature[partner]).max(axis=1) < 1e-3
+    assert same.mean() > 0.75  # an angle at the edge of two bins falls into either, for all that see the point
+
+
+def test_matching_with_care_finds_the_motions_of_a_corner_and_a_box_exactly():
+    pair, motion = corner_and_box()
+    said = fpfh_strong(pair, true_boxes(pair))
+    np.testing.assert_allclose(said.ego_motion, EGO, atol=1e-4)
+    np.testing.assert_allclose(said.motions[0], motion, atol=1e-3)
+    np.testing.assert_allclose(said.flows["fpfh_strong"], pair.flow0, atol=1e-3)
+
+
+def test_without_care_the_motions_are_right_where_every_match_is():
+    pair, _ = corner_and_box(spacing=0.6, ego=np.eye(4), own=np.eye(4))
+    said = fpfh(pair, true_boxes(pair))
+    np.testing.assert_allclose(said.ego_motion, np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(said.motions[0], np.eye(4), atol=1e-6)
+
+
+def test_noise_moves_the_answer_no_more_than_itself():
+    pair, motion = corner_and_box()
+    noisy = pair.scan1.xyz + np.random.default_rng(1).normal(0.0, 0.02, pair.scan1.xyz.shape).astype(np.float32)
+    said = fpfh_strong(replace(pair, scan1=replace(pair.scan1, xyz=noisy)), true_boxes(pair))
+    assert translation_error(said.ego_motion, EGO) < 0.05
+    assert translation_error(said.motions[0], motion, BOX[:3]) < 0.1
+    assert rotation_error(said.motions[0], motion) < 0.07
+
+
+@BOTH
+@pytest.mark.parametrize("points", [0, 1, 2, 3])
+def test_an_object_of_no_to_three_points_has_a_rigid_motion(method, points):
+    pair = make_pair([an_object(12, 0)], points=points)
+    said = method(pair, true_boxes(pair))
+    (flow,) = said.flows.values()
+    assert np.isfinite(flow).all()
+    assert is_rigid(said.motions[0])
+    if points < 3:
+        np.testing.assert_array_equal(said.motions[0], said.ego_motion)
+
+
+@BOTH
+def test_an_empty_background_stands(method):
+    pair = make_pair([an_object(12, 0)], points=60, background=())
+    said = method(pair, true_boxes(pair))
+    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
+    assert is_rigid(said.motions[0])
+
+
+@BOTH
+def test_without_detections_the_world_is_all_that_moves(method):
+    pair, _ = corner_and_box()
+    said = method(pair, None)
+    assert said.motions.shape == (0, 4, 4)
+    assert is_rigid(said.ego_motion)
+
+
+@BOTH
+def test_empty_scans_stand(method):
+    said = method(of_points(np.zeros((0, 3)), np.zeros((0, 3))), None)
+    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
+
+
+@BOTH
+def test_identical_scans_have_no_motion(method):
+    pair, _ = corner_and_box(ego=np.eye(4), own=np.eye(4))
+    said = method(pair, true_boxes(pair))
+    (flow,) = said.flows.values()
+    np.testing.assert_allclose(flow, 0.0, atol=1e-4)

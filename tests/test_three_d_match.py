@@ -1,0 +1,143 @@
+"""3DMatch + Det.: its network, and the shipped small one at work."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matched_scene import BOX, EGO, corner_and_box, of_points
+from pair_factory import make_pair as cast_pair
+from scored_pair import an_object, make_pair
+
+from augkitti.errors import InputError
+from augkitti.frames import is_rigid
+from training.baselines.followed import true_boxes
+from training.metrics import rotation_error, translation_error
+
+torch = pytest.importorskip("torch")
+
+from training.baselines.descriptor_network import (  # noqa: E402
+    PAPER,
+    SMALL,
+    DescriptorConfig,
+    DescriptorNetwork,
+    contrastive_loss,
+    describe,
+    load_network,
+    save_network,
+    shipped_network,
+)
+from training.baselines.tdf import FieldConfig  # noqa: E402
+from training.baselines.three_d_match import (  # noqa: E402
+    CONFIG,
+    keypoints,
+    scene_of,
+    three_d_match,
+    three_d_match_strong,
+)
+
+BOTH = pytest.mark.parametrize("method", [three_d_match, three_d_match_strong], ids=["plain", "strong"])
+TINY = DescriptorConfig((2, 2), (4, 4, 6), 3, FieldConfig(voxel_m=0.2, patch=16))
+
+
+def parameters(config):
+    with torch.device("meta"):
+        return sum(weight.numel() for weight in DescriptorNetwork(config).parameters())
+
+
+def test_the_papers_network_has_its_14_million_parameters():
+    assert parameters(PAPER) == 14_311_488
+    with torch.device("meta"):
+        assert DescriptorNetwork(PAPER)(torch.zeros(2, 30, 30, 30)).shape == (2, 512)
+
+
+def test_layers_that_do_not_fit_the_patch_are_refused():
+    with pytest.raises(ValueError, match="voxels to a side are left"):
+        DescriptorNetwork(replace(SMALL, field=replace(SMALL.field, patch=30)))
+
+
+def test_descriptors_have_unit_length():
+    torch.manual_seed(0)
+    found = describe(DescriptorNetwork(TINY), np.random.default_rng(0).random((5, 16, 16, 16), np.float32))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-5)
+    assert describe(DescriptorNetwork(TINY), np.zeros((0, 16, 16, 16), np.float32)).shape == (0, 3)
+
+
+def test_the_loss_draws_partners_together_and_strangers_apart():
+    one = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    far = torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    assert contrastive_loss(one, one, far, 1.0, 1.0) == 0.0
+    other = torch.tensor([[1.0, 0.0], [1.0, 0.0]])  # the second's partner looks like the first
+    assert contrastive_loss(one, other, far, 1.0, 1.0) == pytest.approx(2.0 / 2 + 1.0)
+    near = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])  # neither partners nor strangers
+    assert contrastive_loss(one, other, near, 1.0, 1.0) == pytest.approx(1.0)
+
+
+def test_a_network_comes_back_from_its_file(tmp_path):
+    torch.manual_seed(0)
+    network = DescriptorNetwork(TINY).half().float()
+    save_network(tmp_path / "n.pt", network, {"steps": 3})
+    again = load_network(tmp_path / "n.pt")
+    assert again.config == TINY
+    patch = np.random.default_rng(0).random((3, 16, 16, 16), np.float32)
+    np.testing.assert_array_equal(describe(again, patch), describe(network, patch))
+
+
+def test_a_file_that_is_no_network_is_named(tmp_path):
+    (tmp_path / "n.pt").write_bytes(b"no")
+    for path, why in ((tmp_path / "n.pt", "no descriptor network"), (tmp_path / "m.pt", "does not exist")):
+        with pytest.raises(InputError, match=why):
+            load_network(path)
+
+
+def test_the_shipped_network_is_small():
+    assert shipped_network().stat().st_size <= 2_000_000
+    assert load_network(shipped_network()).config == SMALL
+
+
+def test_motions_of_a_corner_and_a_box_are_found_to_a_fraction_of_a_voxel():
+    pair, motion = corner_and_box(spacing=0.3)
+    said = three_d_match_strong(pair, true_boxes(pair))
+    assert translation_error(said.ego_motion, EGO) < 0.1
+    assert rotation_error(said.ego_motion, EGO) < 0.01
+    assert translation_error(said.motions[0], motion, BOX[:3]) < 0.2
+    assert rotation_error(said.motions[0], motion) < 0.08
+
+
+@BOTH
+def test_identical_scans_have_no_motion(method):
+    pair, _ = corner_and_box(ego=np.eye(4), own=np.eye(4))
+    said = method(pair, true_boxes(pair))
+    (flow,) = said.flows.values()
+    np.testing.assert_allclose(flow, 0.0, atol=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize("points", [0, 1, 2, 3])
+def test_an_object_of_no_to_three_points_has_a_rigid_motion(method, points):
+    pair = make_pair([an_object(12, 0)], points=points)
+    said = method(pair, true_boxes(pair))
+    (flow,) = said.flows.values()
+    assert np.isfinite(flow).all()
+    assert is_rigid(said.motions[0])
+    if points < 3:
+        np.testing.assert_array_equal(said.motions[0], said.ego_motion)
+
+
+@BOTH
+def test_an_empty_background_and_empty_scans_stand(method):
+    pair = make_pair([an_object(12, 0)], points=60, background=())
+    said = method(pair, true_boxes(pair))
+    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
+    assert is_rigid(said.motions[0])
+    said = method(of_points(np.zeros((0, 3)), np.zeros((0, 3))), None)
+    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
+
+
+def test_a_scan_has_its_keypoints_within_seconds():
+    scan = cast_pair(tick_step=1).pair.scan0
+    start = time.perf_counter()
+    network = load_network(shipped_network())
+    found = keypoints(scene_of(scan.xyz, network), network, CONFIG.voxel_m, CONFIG.most)
+    assert len(found.xyz) >= 1000
+    assert time.perf_counter() - start < 8.0  # the second on two quiet cores; tests share theirs
