@@ -20,6 +20,11 @@ from rich.table import Table
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
 from training.baselines import ego_registration, ego_true, zero
+from training.baselines.clusters import ego_icp_clusters
+from training.baselines.dewan import dewan, dewan_strong
+from training.baselines.fpfh import fpfh, fpfh_strong
+from training.baselines.icp import icp, icp_strong
+from training.baselines.three_d_match import three_d_match, three_d_match_strong
 from training.paper_figures import draw_all
 from training.paper_scores import (
     MIXED,
@@ -38,10 +43,20 @@ from training.report_tables import _finite
 from training.tables_page import captions_of, page_of
 from training.team import Precision, Team, team_of
 
+SLOW = 10  # pairs of each set, for methods that describe every keypoint by a network
 COMPARED: tuple[Compared, ...] = (
     Compared("zero", "Nothing moves", zero, kind=REFERENCE),
     Compared("ego_true", "True ego-motion, all stands", ego_true, kind=REFERENCE),
     Compared("ego_registration", "GICP ego-motion, all stands", ego_registration),
+    Compared("icp", "ICP+Det.", icp, "ICP+Det."),
+    Compared("icp_strong", "ICP+Det., strong", icp_strong),
+    Compared("clusters", "GICP, ICP of clusters", ego_icp_clusters),
+    Compared("3dmatch", "3DMatch+Det.", three_d_match, "3DMatch+Det.", most_pairs=SLOW),
+    Compared("3dmatch_strong", "3DMatch+Det., strong", three_d_match_strong, most_pairs=SLOW),
+    Compared("fpfh", "FPFH+Det.", fpfh, "FPFH+Det."),
+    Compared("fpfh_strong", "FPFH+Det., strong", fpfh_strong),
+    Compared("dewan", "Dewan et al.+Det.", dewan, "Dewan et al.+Det."),
+    Compared("dewan_strong", "Dewan et al.+Det., strong", dewan_strong),
 )
 
 
