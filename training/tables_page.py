@@ -39,8 +39,8 @@ th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; }
 tr.first td { border-top: 2px solid var(--soft); }
 tr.network td { background: var(--ours); } tr.reference td { color: var(--soft); }
 td.best { font-weight: 700; } td .soft { font-weight: 400; font-size: .8em; }
-td .paper { display: block; color: #b3541e; font-weight: 400; font-size: .88em; }
-@media (prefers-color-scheme: dark) { td .paper { color: #e8a06a; } }
+.paper, .papers { color: #b3541e; } td .paper { display: block; font-weight: 400; font-size: .88em; }
+@media (prefers-color-scheme: dark) { .paper, .papers { color: #e8a06a; } }
 figure { margin: 0; } figure img { max-width: 100%; height: auto; display: block; background: #ffffff;
   border: 1px solid var(--line); border-radius: .3rem; }
 nav a { margin-right: 1rem; color: inherit; }
@@ -124,7 +124,7 @@ def captions_of(found: Results) -> tuple[str, str]:
 
 def _legend() -> str:
     return (
-        '<p class="soft">Upper figure: ours, over several runs mean (least to largest); <span style="color:#b3541e">'
+        '<p class="soft">Upper figure: ours, over several runs mean (least to largest); <span class="papers">'
         "below: the paper's</span>, which are of KITTI and of networks trained for days. Bold: the best of ours on a "
         "set. Object translation is that of the motion in LiDAR coordinates, which the paper's figures fit; "
         "&ldquo;object centre&rdquo; is that of the car's centre.</p>"
