@@ -112,10 +112,10 @@ def find_example(pair: AugmentedPair) -> Example | None:
 
 
 def _car_to_show(pair: AugmentedPair) -> int | None:
-    """The virtual car that moves, is near, seen from the side, and has most points through its panes."""
+    """The virtual car ahead that moves, is near, seen from the side, and has most points through its panes."""
     seen = {}
     for row, item in enumerate(pair.objects):
-        if item.origin != "virtual" or item.pose0 is None or abs(item.speed or 0.0) < 2.0:
+        if item.origin != "virtual" or item.pose0 is None or abs(item.speed or 0.0) < 2.0 or item.pose0[0, 3] < 0.0:
             continue
         scanner = transform_points(invert(item.pose0), np.zeros(3))
         distance = float(np.hypot(scanner[0], scanner[1]))

@@ -53,7 +53,7 @@ def draw_all(
     rivals = best_baselines(found.rows)
     if ranked:
         out.append(_zoom(folder, again, ranked, rivals[:1]))
-        chosen = dict.fromkeys(ranked[int(share * (len(ranked) - 1))] for share in SCENES)
+        chosen = dict.fromkeys(ranked[int(share * len(ranked))] for share in SCENES)
         out += [_comparison(folder, k, name, again, rivals) for k, name in enumerate(chosen, start=1)]
     seen = [one for one in found.close if one.points >= _FEWEST_POINTS]
     out += [_failure(folder, k, one.pair_id, again) for k, one in enumerate(seen[:FAILURES], start=1)]
@@ -149,7 +149,7 @@ def _zoom(folder: Path, again: Again, ranked: Sequence[str], rivals: Sequence[st
         _draw_wheel(first, "over ground")
         first.add_patch(_rectangle(limits))
         for k, (title, flow, prediction) in enumerate(panels, start=2):
-            axes = _scene(figure, 1, 1 + len(panels), k, pair, flow, limits, title, size=14.0, arrows=140)
+            axes = _scene(figure, 1, 1 + len(panels), k, pair, flow, limits, title, size=8.0, arrows=140)
             _boxes_of(axes, pair, prediction, again.rules)
         figure.suptitle(name, x=0.03, ha="left", fontsize=11)
     return Picture(
@@ -190,7 +190,7 @@ def _failure(folder: Path, number: int, name: str, again: Again) -> Picture:
     """Cars close to each other, as they are and as the network has them."""
     pair, said = again(name)
     truth = truth_of(pair, again.rules)
-    rows = np.flatnonzero(truth.close & truth.counts)
+    rows = np.flatnonzero(truth.close & truth.judged)
     error = np.linalg.norm(whole_flow(pair, said[OURS], OURS)[truth.rows] - truth.flow, axis=1)
     worst = max(rows, key=lambda row: float(error[truth.object == row].sum()))
     x, y = truth.boxes[worst, :2]
@@ -200,7 +200,7 @@ def _failure(folder: Path, number: int, name: str, again: Again) -> Picture:
     with figure_to(path, (12.0, 6.4)) as figure:
         figure.subplots_adjust(left=0.06, right=0.99, top=0.87, bottom=0.09, wspace=0.14)
         for k, (title, flow, prediction) in enumerate([("truth", pair.flow0, None), *_panels(pair, said, again)], 1):
-            axes = _scene(figure, 1, 2, k, pair, flow, limits, title, size=14.0, arrows=140)
+            axes = _scene(figure, 1, 2, k, pair, flow, limits, title, size=8.0, arrows=140)
             _boxes_of(axes, pair, prediction, again.rules)
         figure.suptitle(
             f"{name}: flow off by {error[here].mean():.2f} m on the {here.sum()} points of close cars", x=0.06,
@@ -261,6 +261,8 @@ def _scene(
     axes.set_title(title, fontsize=10, loc="left")
     axes.tick_params(labelsize=7)
     axes.xaxis.set_major_formatter(lambda value, _: f"{0.0 - value:g}")
+    axes.set_xlabel("y, m", fontsize=8, labelpad=1)
+    axes.set_ylabel("x, m", fontsize=8, labelpad=1)
     xyz = pair.scan0.xyz
     rows = np.flatnonzero(_within(xyz, limits) & (pair.flow_status0 == 0))
     rows = _some(rows, _MOST_DRAWN)
@@ -288,10 +290,10 @@ def _boxes_of(axes: Any, pair: AugmentedPair, said: Prediction | None, rules: Ru
 
 
 def _car_to_show(pair: AugmentedPair, rules: Rules) -> Array:
-    """Box of the car with most points among those that move; of any where none does."""
+    """Box of a car that moves far and has many points; of the one with most where none moves."""
     truth = truth_of(pair, rules)
-    points = np.where(truth.counts, truth.on_points, 0)
-    moving = points * (np.nan_to_num(truth.own_motion_m) > 0.3)
+    points = np.sqrt(np.where(truth.counts, truth.on_points, 0))
+    moving = points * np.nan_to_num(truth.own_motion_m)
     return np.asarray(truth.boxes[int(np.argmax(moving if moving.any() else points))])
 
 
@@ -343,7 +345,7 @@ def _points_chart(folder: Path, found: Results) -> Picture:
                     )
             cars = (f"{name}\n{bins[k]['objects']:,}" for name, k in zip(names, used, strict=True))
             axes.set_xticks(range(len(used)), list(cars), fontsize=8)
-            axes.set_yscale("log")
+            _log_scale(axes)
             axes.set_xlabel("points on the car; cars to find, in all")
             axes.set_title(title, fontsize=11, loc="left")
             axes.grid(alpha=0.3)
@@ -357,6 +359,16 @@ def _points_chart(folder: Path, found: Results) -> Picture:
         "the mean over points and as much as any other in the mean over cars. Right: cars found, for methods that "
         "follow them.",
     )
+
+
+def _log_scale(axes: Any) -> None:
+    """With figures that are read without counting powers."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _cycled(count: int) -> list[str]:

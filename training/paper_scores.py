@@ -281,7 +281,7 @@ def _detections(pair: AugmentedPair, ours: Prediction, boxes: Boxes, rules: Rule
 def _close_cars(pair: AugmentedPair, ours: Prediction, rules: Rules) -> list[CloseCars]:
     """The pair, if cars in it stand close to each other."""
     truth = truth_of(pair, rules)
-    on_close = truth.fg & np.append(truth.close, False)[truth.object] & ours.where[truth.rows]
+    on_close = truth.fg & np.append(truth.close & truth.judged, False)[truth.object] & ours.where[truth.rows]
     if not truth.close_pairs or not on_close.any():
         return []
     error = np.linalg.norm(ours.flows[OURS][truth.rows][on_close] - truth.flow[on_close], axis=1)

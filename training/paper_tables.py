@@ -132,7 +132,7 @@ def ablation_lines(rows: Sequence[Row]) -> list[Line]:
 def ablation_html(rows: Sequence[Row]) -> str:
     """Table 1: ours, the spread over seeds, the paper's below."""
     lines = ablation_lines(rows)
-    heads = ("Evaluated on", "Trained on", *_HEADS, "at centre, m", "pairs", "runs", "steps")
+    heads = ("Evaluated on", "Trained on", *_HEADS, "object centre, m", "pairs", "runs", "steps")
     body = []
     for line in lines:
         steps = {row["step"] for row in line.rows}
@@ -149,7 +149,7 @@ def ablation_html(rows: Sequence[Row]) -> str:
 def comparison_html(rows: Sequence[Row]) -> str:
     """Table 2: the same for every method, then what the paper has in its text or not at all."""
     lines = lines_of(rows, 2)
-    heads = ("Evaluated on", "Method", *_HEADS, "at centre, m", "cars found", "s / pair", "coverage", "pairs")
+    heads = ("Evaluated on", "Method", *_HEADS, "object centre, m", "cars found", "s / pair", "coverage", "pairs")
     body = []
     for line in lines:
         row = line.rows[0]
@@ -159,7 +159,7 @@ def comparison_html(rows: Sequence[Row]) -> str:
             f"<td>{_name_html(line)}</td>",
             *_figure_cells(line, lines),
             f"<td>{_spread_text(line.figure('obj_tr_centre'), 3)}</td>",
-            f"<td>{_NONE if found is None else f'{found.mean:,.0f}'} of {row['objects']:,}</td>",
+            f"<td>{_NONE if found is None else _of(found.mean, row['objects'])}</td>",
             f"<td>{_seconds_text(seconds)}{_paper_html(line.paper.get('seconds'), None)}</td>",
             f"<td>{_percent(line.figure('coverage'))}</td><td>{pairs}</td>",
         ]
@@ -231,12 +231,17 @@ def _seconds_text(one: Spread | None) -> str:
     return f"{one.mean:.{3 if one.mean < 0.1 else 2 if one.mean < 10.0 else 0}f}"
 
 
+def _of(part: float, whole: int) -> str:
+    return f"{part:,.0f} of {whole:,}"
+
+
 def _percent(one: Spread | None) -> str:
     return _NONE if one is None else f"{100.0 * one.mean:.0f} %"
 
 
 # --- LaTeX ---------------------------------------------------------------------------------------------------------
 
+_LATEX_NONE = "n/a"  # a dash beside the paper's figure would be read as its sign
 _LATEX_HEAD = r"""% Needs booktabs, multirow and xcolor. In grey beside each figure: the paper's.
 \providecommand{\paper}[1]{\,{\scriptsize\color{gray}#1}}
 """
@@ -249,14 +254,14 @@ def latex_of(rows: Sequence[Row], captions: tuple[str, str]) -> str:
 
 def _ablation_latex(rows: Sequence[Row], caption: str) -> str:
     lines = ablation_lines(rows)
-    body = _latex_lines(lines, [[_tex(line.trained_on or _NONE)] for line in lines], [[] for _ in lines], 9)
+    body = _latex_lines(lines, [[latex_text(line.trained_on or _NONE)] for line in lines], [[] for _ in lines], 9)
     head = _latex_head((("Eval.", "Dataset"), ("Training", "Dataset")), ())
     return _latex_table("c" * 9, head, body, caption, "tab:ablation")
 
 
 def _comparison_latex(rows: Sequence[Row], caption: str) -> str:
     lines = lines_of(rows, 2)
-    names = [[_tex(line.label) + ("" if line.whole else f" ({line.rows[0]['pairs']} pairs)")] for line in lines]
+    names = [[latex_text(line.label) + ("" if line.whole else f" ({line.rows[0]['pairs']} pairs)")] for line in lines]
     times = [[_latex_seconds(line)] for line in lines]
     head = _latex_head((("Eval.", "Dataset"), ("Method", "")), (("Time", "(s)"),))
     return _latex_table("cc*{7}cc", head, _latex_lines(lines, names, times, 10), caption, "tab:results")
@@ -289,7 +294,7 @@ def _latex_lines(
 
 def _latex_figure(line: Line, lines: Sequence[Line], key: str, digits: int) -> str:
     one, paper = line.figure(key), line.paper.get(key)
-    text = _NONE if one is None else f"{one.mean:.{digits}f}"
+    text = _LATEX_NONE if one is None else f"{one.mean:.{digits}f}"
     if _is_best(line, lines, key, digits):
         text = rf"{{\bf {text}}}"
     if one is not None and line.runs > 1:
@@ -310,7 +315,8 @@ def _latex_table(columns: str, head: str, body: str, caption: str, label: str) -
     )
 
 
-def _tex(text: str) -> str:
+def latex_text(text: str) -> str:
+    """With what LaTeX would take for commands written as signs."""
     for sign in "&%#_":
         text = text.replace(sign, "\\" + sign)
     return text

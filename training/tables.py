@@ -20,6 +20,11 @@ from rich.table import Table
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
 from training.baselines import ego_registration, ego_true, zero
+from training.baselines.clusters import ego_icp_clusters
+from training.baselines.dewan import dewan, dewan_strong
+from training.baselines.fpfh import fpfh, fpfh_strong
+from training.baselines.icp import icp, icp_strong
+from training.baselines.three_d_match import three_d_match, three_d_match_strong
 from training.paper_figures import draw_all
 from training.paper_scores import (
     MIXED,
@@ -38,10 +43,20 @@ from training.report_tables import _finite
 from training.tables_page import captions_of, page_of
 from training.team import Precision, Team, team_of
 
+SLOW = 10  # pairs of each set, for methods that describe every keypoint by a network
 COMPARED: tuple[Compared, ...] = (
     Compared("zero", "Nothing moves", zero, kind=REFERENCE),
     Compared("ego_true", "True ego-motion, all stands", ego_true, kind=REFERENCE),
     Compared("ego_registration", "GICP ego-motion, all stands", ego_registration),
+    Compared("icp", "ICP+Det.", icp, "ICP+Det."),
+    Compared("icp_strong", "ICP+Det., strong", icp_strong),
+    Compared("clusters", "GICP, ICP of clusters", ego_icp_clusters),
+    Compared("3dmatch", "3DMatch+Det.", three_d_match, "3DMatch+Det.", most_pairs=SLOW),
+    Compared("3dmatch_strong", "3DMatch+Det., strong", three_d_match_strong, most_pairs=SLOW),
+    Compared("fpfh", "FPFH+Det.", fpfh, "FPFH+Det."),
+    Compared("fpfh_strong", "FPFH+Det., strong", fpfh_strong),
+    Compared("dewan", "Dewan et al.+Det.", dewan, "Dewan et al.+Det."),
+    Compared("dewan_strong", "Dewan et al.+Det., strong", dewan_strong),
 )
 
 
@@ -62,15 +77,23 @@ class TablesOptions:
     fig3b: tuple[int, int] = (2, 200)  # seeds and steps a network
 
 
-def tables(options: TablesOptions, compared: Sequence[Compared] = COMPARED) -> Results:
+def tables(options: TablesOptions, compared: Sequence[Compared] | None = None) -> Results:
     """The command: `index.html`, `tables.tex`, `tables.json` and `figures/` in a folder.
+
+    Args:
+        options: what is asked for.
+        compared: what stands beside the network; `COMPARED` where not given.
 
     Raises:
         InputError: data sets without the splits, or without pairs in them; runs that are none or do not fit each other.
         MachineError: the disk refused.
     """
+    compared = COMPARED if compared is None else compared
     if options.threads:
         torch.set_num_threads(options.threads)
+    if len(options.k_ak_runs) < len(options.k_runs):
+        counts = f"{len(options.k_runs)} runs trained on K, {len(options.k_ak_runs)} on K and AK"
+        raise InputError("--runs", counts, "name a K+AK run behind each: --runs runs/k runs/k_ak")
     if find_spec("matplotlib") is None:
         raise InputError("matplotlib", "is not installed", "pip install 'augkitti[view]'")
     sets = PaperSets(options.kitti_data, options.data, options.limit)
@@ -81,15 +104,11 @@ def tables(options: TablesOptions, compared: Sequence[Compared] = COMPARED) -> R
         found.about.update(_about(options, runs, team))
         _print_tables(found.rows)
         again = Again(sets, runs, compared, options.boxes, found.rules)
+        content = json.dumps(_finite(found.as_json()), indent=1, allow_nan=False) + "\n"
+        _write(options.out / "tables.json", content)  # before the figures: minutes of scoring are safe then
+        _write(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
         pictures = draw_all(options.out / "figures", found, again, runs[-1].predictor.network, options.fig3b)
-    try:
-        write_text(options.out / "tables.json", json.dumps(_finite(found.as_json()), indent=1, allow_nan=False) + "\n")
-        write_text(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
-        write_text(options.out / "index.html", page_of(found, pictures))
-    except OSError as err:
-        raise MachineError(
-            options.out, f"cannot be written ({err.strerror})", "free space, or give another --out"
-        ) from err
+    _write(options.out / "index.html", page_of(found, pictures))
     print(f"{options.out / 'index.html'}: tables and {len(pictures)} figures; tables.tex and tables.json beside it")
     return found
 
@@ -118,6 +137,13 @@ def _processor() -> str:
         lines = []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return named[0] if named else platform.processor() or platform.machine()
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        write_text(path, text)
+    except OSError as err:
+        raise MachineError(path, f"cannot be written ({err.strerror})", "free space, or give another --out") from err
 
 
 def _make_folder(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from training.paper_figures import Picture
 from training.paper_scores import Results
@@ -12,6 +12,7 @@ from training.paper_tables import (
     ablation_html,
     ablation_lines,
     comparison_html,
+    latex_text,
     lines_of,
     ways_html,
 )
@@ -38,8 +39,8 @@ th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left; }
 tr.first td { border-top: 2px solid var(--soft); }
 tr.network td { background: var(--ours); } tr.reference td { color: var(--soft); }
 td.best { font-weight: 700; } td .soft { font-weight: 400; font-size: .8em; }
-td .paper { display: block; color: #b3541e; font-weight: 400; font-size: .88em; }
-@media (prefers-color-scheme: dark) { td .paper { color: #e8a06a; } }
+.paper, .papers { color: #b3541e; } td .paper { display: block; font-weight: 400; font-size: .88em; }
+@media (prefers-color-scheme: dark) { .paper, .papers { color: #e8a06a; } }
 figure { margin: 0; } figure img { max-width: 100%; height: auto; display: block; background: #ffffff;
   border: 1px solid var(--line); border-radius: .3rem; }
 nav a { margin-right: 1rem; color: inherit; }
@@ -50,7 +51,8 @@ li { margin: .25rem 0; }
 def page_of(found: Results, pictures: Sequence[Picture]) -> str:
     """The whole page."""
     about = found.about
-    first = next(row for row in found.rows if row["table"] == 2)
+    lines = [line for line in lines_of(found.rows, 2) if line.label == "Ours"]
+    counts = [_counts_text(line.rows[0]) for line in lines]
     parts = [
         "<!doctype html>",
         '<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">',
@@ -68,7 +70,7 @@ def page_of(found: Results, pictures: Sequence[Picture]) -> str:
         f'<p class="soft">{html.escape(_ablation_note(found))}</p>',
         '<h2 id="comparison">Table 2: comparison with baselines (test splits)</h2>',
         comparison_html(found.rows),
-        f'<p class="soft">{html.escape(_counts_text(first))} Grey rows are references and no methods. A row marked '
+        f'<p class="soft">{html.escape(" ".join(counts))} Grey rows are references and no methods. A row marked '
         "&ldquo;only&rdquo; is of fewer pairs than the others and takes no part in the bold figures.</p>",
         '<h2 id="ways">Direct scene flow against rigid motions</h2>',
         ways_html(found.rows),
@@ -93,8 +95,10 @@ def verdicts(found: Results) -> list[str]:
             f"Augmentation (Table 1, K+AK): training on K+AK takes the foreground error from {plain:.2f} m to "
             f"{mixed:.2f} m, {mixed / plain:.2f} times; in the paper from 0.58 m to 0.28 m, 0.48 times."
         )
-    else:
+    elif ("K+AK", "K") not in table1:
         out.append("Augmentation (Table 1): no run trained on K was given, so there is nothing to compare with.")
+    else:
+        out.append("Augmentation (Table 1): the validation splits have no car in the grid, so nothing can be said.")
     lines = [line for line in lines_of(found.rows, 2) if line.eval_set == "K+AK"]
     ours = _fg(next((line for line in lines if line.label == "Ours"), None))
     rivals = [(value, line.label) for line in lines if line.kind == BASELINE and line.whole
@@ -111,7 +115,7 @@ def verdicts(found: Results) -> list[str]:
 def captions_of(found: Results) -> tuple[str, str]:
     """Of the two LaTeX tables."""
     data = found.about["data"]
-    names = f"K: \\texttt{{{_tex(data['K'])}}}, AK: \\texttt{{{_tex(data['AK'])}}}"
+    names = f"K: \\texttt{{{latex_text(data['K'])}}}, AK: \\texttt{{{latex_text(data['AK'])}}}"
     return (
         f"{{\\bf Ablation Study}} on our validation splits ({names}). In grey: the paper's figures.",
         f"{{\\bf Comparison to Baselines}} on our test splits ({names}). In grey: the paper's figures.",
@@ -120,10 +124,10 @@ def captions_of(found: Results) -> tuple[str, str]:
 
 def _legend() -> str:
     return (
-        '<p class="soft">Upper figure: ours, over several runs mean (least to largest); <span style="color:#b3541e">'
+        '<p class="soft">Upper figure: ours, over several runs mean (least to largest); <span class="papers">'
         "below: the paper's</span>, which are of KITTI and of networks trained for days. Bold: the best of ours on a "
-        "set. Object translation is that of the motion in LiDAR coordinates, which the paper's figures fit; &ldquo;at "
-        "centre&rdquo; is that of the car's centre.</p>"
+        "set. Object translation is that of the motion in LiDAR coordinates, which the paper's figures fit; "
+        "&ldquo;object centre&rdquo; is that of the car's centre.</p>"
     )
 
 
@@ -134,12 +138,12 @@ def _ablation_note(found: Results) -> str:
         said = ", ".join(f"{on}: {step:,}" for on, step in sorted(steps))
         return (
             f"The runs were trained for different numbers of steps ({said}): what differs is not the data alone. "
-            "`make table1` trains both alike, with three seeds."
+            "make table1 trains both alike, with three seeds."
         )
     return _counts_text(rows[0])
 
 
-def _counts_text(row: dict[str, object]) -> str:
+def _counts_text(row: Mapping[str, object]) -> str:
     return (
         f"{row['eval_set']}: {row['pairs']:,} pairs, {row['fg_points']:,} foreground and {row['bg_points']:,} "
         f"background points, {row['objects']:,} cars to find."
@@ -174,7 +178,7 @@ def _method_html(found: Results) -> str:
         "their own points alone: the JSON has those figures under `given_only`.",
         "s / pair: median wall time of the method alone. Detections are given to the baselines; the network's time "
         "is from the pair in memory to its prediction, voxels included. Three lines of ours are one prediction.",
-        "K+AK is the plain and the augmented pairs together. " + _limit_text(about["limit"]) + ".",
+        "K+AK is the plain and the augmented pairs together. " + f"Scored: {_limit_text(about['limit'])}.",
         "Image-based scene flow (ISF, Fig. 1) is out of scope: nothing here sees a camera image.",
     )
     return _list(texts)
@@ -186,7 +190,7 @@ def _list(texts: Iterable[str]) -> str:
 
 def _limit_text(limit: int | None) -> str:
     return (
-        "All pairs of each split" if limit is None else f"At most {limit} pairs of each set and split, spread over it"
+        "all pairs of each split" if limit is None else f"at most {limit} pairs of each set and split, spread over it"
     )
 
 
@@ -196,14 +200,14 @@ def _boxes_text(found: Results) -> str:
 
 def _machine_text(found: Results) -> str:
     machine = found.about["machine"]
-    where = machine["device"] if machine["device"] != "cpu" else f"{machine['threads']} threads"
+    where = (
+        machine["device"]
+        if machine["device"] != "cpu"
+        else f"{machine['threads']} thread" + "s" * (machine["threads"] > 1)
+    )
     return f"Times on {machine['processor']}, {machine['cores']} cores; the network on {where}."
 
 
 def _fg(line: Line | None) -> float | None:
     one = None if line is None else line.figure("fg_epe")
     return None if one is None else one.mean
-
-
-def _tex(text: str) -> str:
-    return text.replace("_", "\\_")
