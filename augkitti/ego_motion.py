@@ -18,6 +18,7 @@ from augkitti.scan_pair import Scan
 EgoSource = Literal["oxts", "poses", "registration", "truth"]
 METHOD = "ego-motion 2"  # part of cache keys: raise it when a figure below or the method changes
 
+_FEWEST_POINTS = 20  # of a scan that can be registered; of an empty one the library makes a crash
 _ROLL, _PITCH, _YAW, _VN, _VE, _VU = 3, 4, 5, 6, 7, 10  # columns of an OXTS row
 
 
@@ -72,7 +73,12 @@ def register(xyz0: Array, xyz1: Array, guesses: tuple[F64, ...] | None = None) -
         xyz1: (M, 3) points of scan 1.
         guesses: motions to start from; without, driving straight on at 0, 12.5 and 25 m/s. The start whose coarse
             result leaves the smallest distances goes on to the fine step.
+
+    Returns:
+        The motion; the first guess, or none, where a scan has under 20 points and so tells nothing.
     """
+    if min(len(xyz0), len(xyz1)) < _FEWEST_POINTS:
+        return guesses[0] if guesses else np.eye(4)
     starts = guesses or tuple(pose_from_xyz_yaw(-step, 0.0, 0.0, 0.0) for step in (0.0, 1.3, 2.6))
     coarse = [_align(xyz0, xyz1, start, voxel_m=1.0, reach_m=2.0) for start in starts]
     if len(coarse) > 1:

@@ -64,6 +64,14 @@ def test_odometry_poses_are_conjugated_with_the_calibration() -> None:
     np.testing.assert_allclose(found, compose(invert(T_world_velo1), T_world_velo0), atol=1e-12)
 
 
+@pytest.mark.parametrize("counts", [(0, 500), (500, 0), (0, 0), (19, 500)])
+def test_a_scan_with_hardly_a_point_tells_no_motion(counts) -> None:
+    scan0, scan1 = (np.random.default_rng(0).normal(size=(count, 3)) for count in counts)
+    np.testing.assert_array_equal(register(scan0, scan1), np.eye(4))
+    guess = pose_from_xyz_yaw(-1.0, 0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(register(scan0, scan1, (guess,)), guess)
+
+
 def test_registration_finds_the_motion_without_a_guess_and_repeats_its_bytes(scans) -> None:
     drive, scan0, scan1 = scans
     found = register(scan0.xyz, scan1.xyz)

@@ -100,8 +100,7 @@ def dewan_strong(pair: AugmentedPair, detections: Prediction | None = None) -> P
 
 def scene_flow_of(pair: AugmentedPair, detections: Prediction | None, config: DewanConfig) -> Prediction:
     """Either of the two; the module tells how."""
-    told = min(len(pair.scan0), len(pair.scan1)) >= _FEWEST_TO_LAY_OVER
-    start = register(pair.scan0.xyz, pair.scan1.xyz) if config.laid_over and told else np.eye(4)
+    start = register(pair.scan0.xyz, pair.scan1.xyz) if config.laid_over else np.eye(4)
     scan0 = thinned(pair.scan0.xyz, start, config.region, config.vertex_m, config)
     # what leaves the region is still found
     scan1 = thinned(pair.scan1.xyz, np.eye(4), _grown(config.region, config.window_m), config.target_m, config)
@@ -355,7 +354,6 @@ def _pool(xyz: F32, flow: F32, rows: I64, otherwise: F64, config: DewanConfig) -
     return ransac_rigid(points, points + flow[rows], 0.1, np.random.default_rng(0), draws=100)[0]
 
 
-_FEWEST_TO_LAY_OVER = 20  # points: small_gicp crashes on an empty scan
 _BLOCK_M = 6.0  # vertices that are compared at once
 _GROUND_REACH_M = 6.0  # rings on the ground are as far apart as this
 

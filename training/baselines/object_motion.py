@@ -71,10 +71,8 @@ def follow(points0: F64, T_velo1_velo0: F64, scan1: SecondScan, yaw0_rad: float 
     heading = None if yaw0_rad is None else yaw0_rad + yaw_of(T_velo1_velo0)
     costs = [fit(motion) + _sideways(motion, centre, heading) for motion in tried]
     best = int(np.argmin(costs))
-    if costs[best] >= _BETTER * fit(still):
-        return T_velo1_velo0
     moved = min((tried[best], _polished(fit, tried[best], centre)), key=fit)
-    return compose(moved, T_velo1_velo0)
+    return compose(moved, T_velo1_velo0) if fit(moved) < _BETTER * fit(still) else T_velo1_velo0
 
 
 def likely_shifts(points: F64, around: F64) -> F64:

@@ -193,11 +193,11 @@ class _Pattern:
 
     def sum_matches(self, blocks: F64) -> F64:
         """Blocks (D, 6, 7) summed over the matches of each vertex."""
-        return np.asarray((self._matches @ blocks.reshape(len(blocks), -1)).reshape(self._vertices, 6, 7))
+        return np.asarray((self._matches @ blocks.reshape(-1, 6 * 7)).reshape(self._vertices, 6, 7))
 
     def sum_edges(self, blocks: F64) -> F64:
         """Blocks (2 E, 6, 7), first ends first, summed over the edges of each vertex."""
-        return np.asarray((self._ends @ blocks.reshape(len(blocks), -1)).reshape(self._vertices, 6, 7))
+        return np.asarray((self._ends @ blocks.reshape(-1, 6 * 7)).reshape(self._vertices, 6, 7))
 
     def solve(self, diagonal: F64, across: F64, gradient: F64, damping: float) -> F64:
         """The step (V, 6) of Levenberg-Marquardt."""
