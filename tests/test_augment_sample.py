@@ -247,6 +247,19 @@ def test_without_any_change_asked_for_the_sample_stays():
         same(augment_sample(sample, STILL, np.random.default_rng(0)), sample)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_share_of_the_pairs_is_turned_by_up_to_a_right_angle(share):
+    config = STILL.model_copy(update={"rotation_rad": 0.1, "wide_share": share})
+    sample = replace(MADE[0], xyz0=MADE[0].xyz0[:50], xyz1=MADE[0].xyz1[:50], flow0=MADE[0].flow0[:50])
+    turns = []
+    for seed in range(200):
+        heading = augment_sample(sample, config, np.random.default_rng(seed)).boxes0[0, 6]
+        turns.append(abs(heading - sample.boxes0[0, 6]))
+    assert max(turns) <= (0.5 * np.pi if share else 0.1) + 1e-9
+    # of the widely turned ones, all but 0.1 of a right angle's share are turned by more than the others can be
+    assert np.mean(np.array(turns) > 0.1) == pytest.approx(share * (1.0 - 0.1 / (0.5 * np.pi)), abs=0.1)
+
+
 def test_the_same_draws_give_the_same_sample():
     same(wild(MADE[1], 5), wild(MADE[1], 5))
     assert (wild(MADE[1], 5).xyz0 != wild(MADE[1], 6).xyz0).any()

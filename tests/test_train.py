@@ -243,6 +243,18 @@ def test_a_finished_run_is_not_overwritten_and_others_settings_do_not_go_on(data
     assert "\n" not in str(error.value)
 
 
+def test_only_the_named_parts_learn(data, tmp_path):
+    first = load_checkpoint(train(options(data, tmp_path / "a", steps=1)))
+    config = SETTINGS.train.model_copy(update={"parts": ("object_decoder",)})
+    part = SETTINGS.model_copy(update={"train": config})
+    second = load_checkpoint(train(options(data, tmp_path / "b", part, steps=2, init=tmp_path / "a")))
+    for name, value in first.weights.items():  # running figures of batch norms among them
+        assert value.equal(second.weights[name]) != name.startswith("object_decoder"), name
+    unknown = SETTINGS.model_copy(update={"train": config.model_copy(update={"parts": ("head",)})})
+    with pytest.raises(InputError, match="`head` is no part of the network; name some of feature_encoder"):
+        train(options(data, tmp_path / "c", unknown))
+
+
 def test_a_run_starts_from_anothers_weights(data, tmp_path):
     first = load_checkpoint(train(options(data, tmp_path / "a", steps=1)))
     slow = tiny_settings(learning_rate=1e-12, weight_decay=0.0)

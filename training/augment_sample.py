@@ -22,6 +22,7 @@ from augkitti.scan_pair import I64, Bool
 from training.config import TrainConfig
 from training.sample import Sample
 
+_WIDE_RAD = 0.5 * np.pi  # takes what the camera sees, and so labels, to every place before the car
 _ABOVE_UNDERSIDE_M = 0.3  # of a box: below, what lies in it is ground
 _EGO_BOX = np.array([0.0, 0.0, 0.0, 5.5, 2.4, 2.0, 0.0])  # the ego car, roughly: no object is shifted into it
 
@@ -34,7 +35,8 @@ def augment_sample(sample: Sample, config: TrainConfig, rng: np.random.Generator
     ego_turn = config.ego_turn_rad * rng.standard_normal()
     ego_shift = config.ego_shift_m * rng.standard_normal(2)
     factor = 1.0 + config.scale * rng.uniform(-1.0, 1.0)
-    angle_rad = config.rotation_rad * rng.uniform(-1.0, 1.0)
+    widest_rad = _WIDE_RAD if rng.random() < config.wide_share else config.rotation_rad
+    angle_rad = widest_rad * rng.uniform(-1.0, 1.0)
     mirror = config.flip and rng.random() < 0.5
     if turns.any() or shifts.any():
         sample = move_objects(sample, turns, shifts)

@@ -247,11 +247,22 @@ def open_run(options: TrainOptions, team: Team) -> Run:
 
 
 def to_training(network: PointFlowNet, config: TrainConfig) -> PointFlowNet:
-    """The same network in training mode; its batch norms in that of predicting where they are frozen."""
+    """The same network in training mode; what does not learn (`train.parts`, `train.frozen_norms`) stays as it is.
+
+    Raises:
+        InputError: `train.parts` names no part of the network.
+    """
     network.train()
-    for part in network.modules():
-        if config.frozen_norms and isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d):
-            part.eval()
+    known = [name for name, _ in network.named_children()]
+    for name in config.parts:
+        if name not in known:
+            raise InputError("train.parts", f"`{name}` is no part of the network", f"name some of {', '.join(known)}")
+    for name, part in network.named_children():
+        learns = not config.parts or name in config.parts
+        part.requires_grad_(learns)
+        for module in part.modules():
+            if (config.frozen_norms or not learns) and isinstance(module, nn.BatchNorm1d | nn.BatchNorm2d):
+                module.eval()
     return network
 
 
