@@ -52,7 +52,7 @@ def main() -> None:
     field = CONFIGS[asked.config].field
     optimiser = torch.optim.AdamW(network.parameters(), asked.learning_rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, asked.learning_rate, asked.steps, pct_start=0.1)
-    facts = {name: str(value) if isinstance(value, Path) else value for name, value in vars(asked).items()}
+    facts = {name: value for name, value in vars(asked).items() if name != "out"}
     facts["data"] = [path.name for path in asked.data]
     recent: list[tuple[float, float]] = []
     start = time.perf_counter()
