@@ -394,7 +394,8 @@ def _draw_car(
     scanner = transform_points(T_car_velo0, np.zeros(3))
     bearing = float(np.arctan2(scanner[1], scanner[0]))
     turned = bearing + np.deg2rad(np.arange(-40.0, 41.0, 5.0))
-    to_view = _view(float(turned[np.argmax(np.abs(np.sin(2.0 * turned)))]), np.deg2rad(20.0))  # rather from a corner
+    from_a_corner = float(turned[np.argmax(np.abs(np.sin(2.0 * turned)))])
+    to_view = viewing_axes(from_a_corner, np.deg2rad(20.0))
 
     local = transform_points(T_car_velo0, pair.scan0.xyz)
     mine = pair.scan0.instance == row
@@ -441,7 +442,7 @@ def _depth(points: Array, to_view: F64) -> F64:
     return np.asarray((np.asarray(points, dtype=np.float64) * to_view[:, 2]).sum(axis=1))
 
 
-def _view(azimuth_rad: float, elevation_rad: float) -> F64:
+def viewing_axes(azimuth_rad: float, elevation_rad: float) -> F64:
     """Columns: picture right, picture up, towards the viewer who stands at this bearing and height."""
     ca, sa, ce, se = np.cos(azimuth_rad), np.sin(azimuth_rad), np.cos(elevation_rad), np.sin(elevation_rad)
     towards = np.array([ca * ce, sa * ce, se])

@@ -13,7 +13,7 @@ import numpy as np
 
 from augkitti.augmentation import augment_pair, prepare_pair, prepare_scan
 from augkitti.config import Config
-from augkitti.draw import CAR_COLOURS, REGION_COLOUR, REMOVED_COLOUR, SURFACE_COLOURS, figure_to
+from augkitti.draw import CAR_COLOURS, REGION_COLOUR, REMOVED_COLOUR, SURFACE_COLOURS, figure_to, viewing_axes
 from augkitti.frames import (
     F64,
     Array,
@@ -148,7 +148,7 @@ def draw_windows(example: Example, path: Path) -> None:
     bearing = float(np.arctan2(scanner[1], scanner[0]))
     turned = bearing + np.deg2rad(np.arange(-30.0, 31.0, 5.0))
     azimuth = float(turned[np.argmax(np.abs(np.sin(2.0 * turned)))])
-    views = (_view(azimuth, np.deg2rad(18.0)), _view(bearing, np.deg2rad(89.0)))
+    views = (viewing_axes(azimuth, np.deg2rad(18.0)), viewing_axes(bearing, np.deg2rad(89.0)))
     with figure_to(path, (12.0, 8.4)) as figure:
         figure.subplots_adjust(left=0.01, right=0.99, top=0.93, bottom=0.07, wspace=0.02, hspace=0.03)
         shown: set[int] = set()
@@ -208,14 +208,6 @@ def _surface_legend(figure: Any, shown: Sequence[int]) -> None:
 
     handles = [Line2D([], [], marker="o", ls="", ms=7, color=SURFACE_COLOURS[k], label=SURFACE_NAMES[k]) for k in shown]
     figure.legend(handles=handles, loc="lower center", ncols=max(len(handles), 1), frameon=False, fontsize=10)
-
-
-def _view(azimuth_rad: float, elevation_rad: float) -> F64:
-    """Columns: picture right, picture up, towards the viewer who stands at this bearing and height."""
-    ca, sa, ce, se = np.cos(azimuth_rad), np.sin(azimuth_rad), np.cos(elevation_rad), np.sin(elevation_rad)
-    towards = np.array([ca * ce, sa * ce, se])
-    right = np.array([-sa, ca, 0.0])
-    return np.stack([right, np.cross(towards, right), towards], axis=1)
 
 
 # --- workflow ------------------------------------------------------------------------------------------------------

@@ -8,12 +8,10 @@ and for each object `object_motion.follow`, which starts from the ego-motion and
 import numpy as np
 from scipy.spatial import cKDTree
 
-from augkitti.config import GroundConfig
 from augkitti.ego_motion import register
-from augkitti.frames import F32, F64
-from augkitti.ground import fit_ground, standing_points
 from augkitti.scan_pair import AugmentedPair
 from training.baselines.followed import FEWEST_POINTS, boxes_of, followed, object_points
+from training.baselines.matching import one_a_voxel, standing
 from training.baselines.object_motion import SecondScan, follow
 from training.baselines.rigid_fit import closest_points
 from training.predictions import Prediction
@@ -30,7 +28,8 @@ def icp(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction
     rows = object_points(xyz0, boxes_of(detections))
     tree1 = cKDTree(pair.scan1.xyz.astype(np.float64))
     world = np.delete(xyz0, np.concatenate([np.empty(0, np.int64), *rows]), axis=0)
-    ego = closest_points(one_a_voxel(world, _VOXEL_M).astype(np.float64), tree1)
+    thin = world[one_a_voxel(world, _VOXEL_M, np.arange(len(world)))]
+    ego = closest_points(thin.astype(np.float64), tree1)
     motions = [
         ego if len(mine) < FEWEST_POINTS else closest_points(xyz0[mine].astype(np.float64), tree1) for mine in rows
     ]
@@ -44,21 +43,11 @@ def icp_strong(pair: AugmentedPair, detections: Prediction | None = None) -> Pre
     """
     xyz0 = pair.scan0.xyz
     ego = register(xyz0, pair.scan1.xyz)
-    scan1 = SecondScan.of(standing(pair.scan1.xyz))
+    xyz1 = pair.scan1.xyz
+    scan1 = SecondScan.of(xyz1[standing(xyz1)].astype(np.float64))
     boxes = boxes_of(detections)
     motions = [
         ego if len(mine) < FEWEST_POINTS else follow(xyz0[mine].astype(np.float64), ego, scan1, float(box[6]))
         for mine, box in zip(object_points(xyz0, boxes), boxes, strict=True)
     ]
     return followed("icp_strong", pair, ego, detections, motions)
-
-
-def one_a_voxel(xyz: F32, voxel_m: float) -> F32:
-    """The first point (n, 3) of each occupied voxel of points (N, 3)."""
-    _, first = np.unique(np.floor(xyz / voxel_m).astype(np.int64), axis=0, return_index=True)
-    return xyz[np.sort(first)]
-
-
-def standing(xyz: F32) -> F64:
-    """Points (M, 3) of a scan (N, 3) that stand on the ground or hang over it."""
-    return np.asarray(xyz[standing_points(xyz, fit_ground(xyz, GroundConfig()))], dtype=np.float64)
