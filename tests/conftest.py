@@ -1,11 +1,22 @@
 """Fixtures that several test modules share."""
 
+import faulthandler
 import os
+import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_sessionfinish() -> None:
+    """What hangs after the last test tells where, too, and ends."""
+    faulthandler.dump_traceback_later(300, exit=True, file=sys.__stderr__)
+
+
+def pytest_unconfigure() -> None:
+    faulthandler.cancel_dump_traceback_later()
 
 
 @pytest.fixture(scope="session")
