@@ -82,15 +82,9 @@ checkpoint: build/k/splits.json ## the shipped checkpoint, trained on embedded s
 table1: build/k/splits.json ## what augmented pairs add to plain ones, in small: an hour on two cores, into build/table1
 	$(BIN)/python benchmarks/table1.py build/k build/ak
 
-K_STEPS ?= 700
-PAIRS ?= 30
-
-build/k_run/checkpoint.pt: | build/k/splits.json
-	OMP_NUM_THREADS=1 $(BIN)/torchrun --nproc-per-node 2 -m training train --data build/k --config small --steps $(K_STEPS) \
-	  --threads 1 --validation none --out build/k_run
-
-tables: build/k/splits.json build/k_run/checkpoint.pt ## Tables 1 and 2 and the paper's figures, PAIRS=30 a set: half an hour on two cores, into build/report
-	$(BIN)/pointflownet tables --runs build/k_run training/checkpoints/small.pt --data build/ak --kitti-data build/k --limit $(PAIRS) --out build/report
+tables: $(STAMP) ## Tables 1 and 2 and the paper's figures on 60 embedded streets of their own: half an hour on two cores, into build/paper/report
+	env -u AUGKITTI_KITTI PATH="$(CURDIR)/$(BIN):$$PATH" N=300 SEED=1 CONFIG=small STEPS=500 PROCESSES=2 LIMIT=30 \
+	  K_AK=training/checkpoints/small.pt pipelines/paper_tables.sh build/paper
 
 clean: ## remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build *.egg-info

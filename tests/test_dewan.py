@@ -248,45 +248,6 @@ def test_what_falls_in_the_same_cells_is_followed_exactly():
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_scans_that_are_the_same_stand_still(name):
-    pair = street(np.random.default_rng(2), np.eye(4), np.eye(4))
-    said = METHODS[name](pair, true_boxes(pair))
-    assert np.linalg.norm(said.flows[name][said.where], axis=1).mean() < 0.02
-    np.testing.assert_allclose(said.ego_motion, np.eye(4), atol=0.05)
-    np.testing.assert_allclose(said.motions[0], np.eye(4), atol=0.05)
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_without_detections_there_are_no_motions_of_objects(name):
-    pair = street(np.random.default_rng(3), np.eye(4), np.eye(4))
-    for detections in (None, replace(true_boxes(pair), boxes=None, scores=None)):
-        said = METHODS[name](pair, detections)
-        assert said.boxes.shape == (0, 7)
-        assert said.motions.shape == (0, 4, 4)
-        assert said.where.any()
-
-
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("count", range(4))
-def test_an_object_of_few_points_has_a_motion_all_the_same(name, count):
-    pair = make_pair([an_object(12.0, 3.0)], points=count)
-    said = METHODS[name](pair, true_boxes(pair))
-    assert np.isfinite(said.flows[name]).all()
-    np.testing.assert_array_equal(said.motions[0], said.ego_motion)
-
-
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("which", ["scan0", "scan1", "both"])
-def test_an_empty_scan_gives_an_answer_without_flow(name, which):
-    pair = make_pair([an_object(12.0, 3.0)])
-    for k in ("scan0", "scan1") if which == "both" else (which,):
-        pair = replace(pair, **{k: replace(pair.scan0, xyz=np.zeros((0, 3), np.float32))})
-    said = METHODS[name](pair, true_boxes(pair))
-    assert not said.where.any()
-    np.testing.assert_array_equal(said.motions[0], said.ego_motion)
-
-
-@pytest.mark.parametrize("name", METHODS)
 def test_a_car_on_an_empty_plain_is_followed_and_the_world_stands(name):
     car_motion = pose_from_xyz_yaw(0.6, 0.0, 0.0, 0.0)
     pair = street(np.random.default_rng(4), car_motion, np.eye(4), empty=True)

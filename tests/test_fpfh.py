@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matched_scene import BOX, EGO, corner_and_box, of_points, spaced
+from matched_scene import BOX, EGO, corner_and_box, spaced
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from scored_pair import an_object, make_pair
 
-from augkitti.frames import is_rigid
 from training.baselines.followed import true_boxes
 from training.metrics import rotation_error, translation_error
 
@@ -19,7 +17,6 @@ pytest.importorskip("libusb_package", reason="Open3D is not installed (extra `fi
 
 from training.baselines.fpfh import STRONG, fpfh, fpfh_keypoints, fpfh_strong
 
-BOTH = pytest.mark.parametrize("method", [fpfh, fpfh_strong], ids=["plain", "strong"])
 FINE = replace(STRONG, voxel_m=0.08)  # so that every point has neighbours enough for a normal
 
 
@@ -65,45 +62,3 @@ def test_noise_moves_the_answer_no_more_than_itself():
     assert translation_error(said.ego_motion, EGO) < 0.05
     assert translation_error(said.motions[0], motion, BOX[:3]) < 0.1
     assert rotation_error(said.motions[0], motion) < 0.07
-
-
-@BOTH
-@pytest.mark.parametrize("points", [0, 1, 2, 3])
-def test_an_object_of_no_to_three_points_has_a_rigid_motion(method, points):
-    pair = make_pair([an_object(12, 0)], points=points)
-    said = method(pair, true_boxes(pair))
-    (flow,) = said.flows.values()
-    assert np.isfinite(flow).all()
-    assert is_rigid(said.motions[0])
-    if points < 3:
-        np.testing.assert_array_equal(said.motions[0], said.ego_motion)
-
-
-@BOTH
-def test_an_empty_background_stands(method):
-    pair = make_pair([an_object(12, 0)], points=60, background=())
-    said = method(pair, true_boxes(pair))
-    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
-    assert is_rigid(said.motions[0])
-
-
-@BOTH
-def test_without_detections_the_world_is_all_that_moves(method):
-    pair, _ = corner_and_box()
-    said = method(pair, None)
-    assert said.motions.shape == (0, 4, 4)
-    assert is_rigid(said.ego_motion)
-
-
-@BOTH
-def test_empty_scans_stand(method):
-    said = method(of_points(np.zeros((0, 3)), np.zeros((0, 3))), None)
-    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
-
-
-@BOTH
-def test_identical_scans_have_no_motion(method):
-    pair, _ = corner_and_box(ego=np.eye(4), own=np.eye(4))
-    said = method(pair, true_boxes(pair))
-    (flow,) = said.flows.values()
-    np.testing.assert_allclose(flow, 0.0, atol=1e-4)

@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matched_scene import BOX, EGO, corner_and_box, of_points
+from matched_scene import BOX, EGO, corner_and_box
 from pair_factory import make_pair as cast_pair
-from scored_pair import an_object, make_pair
 
 from augkitti.errors import InputError
-from augkitti.frames import is_rigid
 from training.baselines.followed import true_boxes
 from training.metrics import rotation_error, translation_error
 
@@ -31,11 +29,9 @@ from training.baselines.three_d_match import (  # noqa: E402
     CONFIG,
     keypoints,
     scene_of,
-    three_d_match,
     three_d_match_strong,
 )
 
-BOTH = pytest.mark.parametrize("method", [three_d_match, three_d_match_strong], ids=["plain", "strong"])
 TINY = DescriptorConfig((2, 2), (4, 4, 6), 3, FieldConfig(voxel_m=0.2, patch=16))
 
 
@@ -101,36 +97,6 @@ def test_motions_of_a_corner_and_a_box_are_found_to_a_fraction_of_a_voxel():
     assert rotation_error(said.ego_motion, EGO) < 0.01
     assert translation_error(said.motions[0], motion, BOX[:3]) < 0.2
     assert rotation_error(said.motions[0], motion) < 0.08
-
-
-@BOTH
-def test_identical_scans_have_no_motion(method):
-    pair, _ = corner_and_box(ego=np.eye(4), own=np.eye(4))
-    said = method(pair, true_boxes(pair))
-    (flow,) = said.flows.values()
-    np.testing.assert_allclose(flow, 0.0, atol=1e-4)
-
-
-@BOTH
-@pytest.mark.parametrize("points", [0, 1, 2, 3])
-def test_an_object_of_no_to_three_points_has_a_rigid_motion(method, points):
-    pair = make_pair([an_object(12, 0)], points=points)
-    said = method(pair, true_boxes(pair))
-    (flow,) = said.flows.values()
-    assert np.isfinite(flow).all()
-    assert is_rigid(said.motions[0])
-    if points < 3:
-        np.testing.assert_array_equal(said.motions[0], said.ego_motion)
-
-
-@BOTH
-def test_an_empty_background_and_empty_scans_stand(method):
-    pair = make_pair([an_object(12, 0)], points=60, background=())
-    said = method(pair, true_boxes(pair))
-    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
-    assert is_rigid(said.motions[0])
-    said = method(of_points(np.zeros((0, 3)), np.zeros((0, 3))), None)
-    np.testing.assert_array_equal(said.ego_motion, np.eye(4))
 
 
 def test_a_scan_has_its_thousand_keypoints():

@@ -93,7 +93,7 @@ def evaluate(options: EvaluateOptions) -> Report:
         if options.least_points is not None:
             rules = replace(rules, least_points=options.least_points)
         predictors = [lambda pair: found.of(pair.pair_id, len(pair.scan0)), *baseline_predictors()]
-        pairs = _told("scored", sets.pairs(options.limit), sets.count(options.limit))
+        pairs = with_progress("scored", sets.pairs(options.limit), sets.count(options.limit))
         about = {key: value for key, value in found.about.items() if key != "settings"}
         report = score_pairs(pairs, predictors, rules).report(about)
         evaluated_on = "+".join(path.resolve().name for path in options.data)
@@ -112,7 +112,7 @@ def quick_figures(
     """Figures for the training log, on pairs spread over the split; empty where a data set has none."""
     if why_no_figures(data, split) is not None:
         return {}
-    sets = [_open(folder, split) for folder, _ in data]
+    sets = [open_split(folder, split) for folder, _ in data]
     predictor = Predictor(network, settings, team)
     each = max(limit // len(sets), 1)
     pairs = (one[k * len(one) // min(each, len(one))] for one in sets for k in range(min(each, len(one))))
@@ -132,7 +132,7 @@ def why_no_figures(data: Sequence[tuple[Path, float]], split: str) -> str | None
         raise InputError("--validation", f"`{split}` is no split", f"give {', '.join(SPLIT_NAMES)}, or none")
     try:
         for folder, _ in data:
-            _open(folder, split)
+            open_split(folder, split)
     except InputError as err:
         return str(err)
     return None
@@ -155,7 +155,7 @@ class _Sets:
         if len(set(names)) < len(names):
             names = [str(place) for place in places]
         before = [f"{name}:" for name in names] if len(names) > 1 else [""]
-        self._sets = {name: _open(folder, split) for name, folder in zip(before, folders, strict=True)}
+        self._sets = {name: open_split(folder, split) for name, folder in zip(before, folders, strict=True)}
 
     def count(self, limit: int | None) -> int:
         """Of pairs, at most `limit` of each set."""
@@ -173,7 +173,12 @@ class _Sets:
         return replace(data[name.removeprefix(before)], pair_id=name)
 
 
-def _open(folder: Path, split: str | None) -> Dataset:
+def open_split(folder: Path, split: str | None) -> Dataset:
+    """A data set's split, or all of it.
+
+    Raises:
+        InputError: there is none, it has no splits, or no pair in this one.
+    """
     if split is not None and not (folder / "splits.json").is_file() and (folder / "dataset.json").is_file():
         raise InputError(folder, "has no splits", f"run `augkitti split {folder}`, or give --split all")
     data = open_dataset(folder, split)
@@ -184,7 +189,7 @@ def _open(folder: Path, split: str | None) -> Dataset:
     return data
 
 
-def _told(what: str, items: Iterable[_Item], total: int) -> Iterator[_Item]:
+def with_progress(what: str, items: Iterable[_Item], total: int) -> Iterator[_Item]:
     """The items; now and then, and at the end, a line says how many are done and how long each takes."""
     start = said = time.perf_counter()
     for done, item in enumerate(items, start=1):
@@ -210,7 +215,7 @@ def _predict_to(file: Path, sets: _Sets, options: EvaluateOptions) -> Settings:
     }
     with team_of(options.device, options.precision) as team:
         predictor = Predictor(network, checkpoint.settings, team)
-        pairs = _told("predicted", sets.pairs(options.limit), sets.count(options.limit))
+        pairs = with_progress("predicted", sets.pairs(options.limit), sets.count(options.limit))
         try:
             write_predictions(file, predict_pairs(predictor, pairs), about)
         except OSError as err:

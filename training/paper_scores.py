@@ -22,7 +22,7 @@ from augkitti.scan_pair import AugmentedPair
 from training.baselines import Method
 from training.baselines.followed import sure, true_boxes
 from training.checkpoint import load_checkpoint, network_of, shipped_checkpoint
-from training.evaluate import _open, _told
+from training.evaluate import open_split, with_progress
 from training.paper_tables import BASELINE, NETWORK, OURS, SETS, Row, lines_of, paper_figures
 from training.predict import Predictor
 from training.predictions import Prediction
@@ -92,7 +92,7 @@ class PaperSets:
         if kitti_data.resolve() == data.resolve():
             raise InputError(data, "is given for --data and for --kitti-data", "give the plain set to --kitti-data")
         self._sets: dict[str, dict[str, Dataset]] = {
-            split: {"K": _open(kitti_data, split), "AK": _open(data, split)} for split in SPLITS.values()
+            split: {"K": open_split(kitti_data, split), "AK": open_split(data, split)} for split in SPLITS.values()
         }
         self._limit = limit
 
@@ -151,12 +151,12 @@ def compare(sets: PaperSets, runs: Sequence[TrainedRun], compared: Sequence[Comp
     """Every run on the validation splits; those of K+AK and every method on the test splits."""
     rules = Rules.of(runs[0].predictor.settings)
     ablation, comparison = _Book(1, rules), _Book(2, rules)
-    for name, _, _, pair in _told("validation: scored", sets.pairs("validation"), sets.count("validation")):
+    for name, _, _, pair in with_progress("validation: scored", sets.pairs("validation"), sets.count("validation")):
         for run in runs:
             ablation.add(name, run.name, pair, *_timed(partial(run.predictor, pair)))
     mixed = [run for run in runs if run.trained_on == MIXED]
     close: list[CloseCars] = []
-    for name, number, count, pair in _told("test: scored", sets.pairs("test"), sets.count("test")):
+    for name, number, count, pair in with_progress("test: scored", sets.pairs("test"), sets.count("test")):
         first: Prediction | None = None
         for run in mixed:
             prediction, seconds = _timed(partial(run.predictor, pair))

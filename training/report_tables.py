@@ -114,7 +114,7 @@ def as_latex(report: Report, evaluated_on: str = "") -> str:
 
 def as_json(report: Report) -> str:
     """`{"rows": [...], "rules": {...}, "about": {...}}`; null where a method has no such figure."""
-    return json.dumps(_finite(report.as_json()), indent=1, allow_nan=False) + "\n"
+    return json.dumps(finite(report.as_json()), indent=1, allow_nan=False) + "\n"
 
 
 def pairs_csv(report: Report) -> str:
@@ -209,10 +209,10 @@ def _flat(row: dict[str, Any], before: str = "") -> dict[str, Any]:
     return out
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """With None for what JSON cannot hold."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and value != value else value

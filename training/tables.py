@@ -39,7 +39,7 @@ from training.paper_scores import (
     load_runs,
 )
 from training.paper_tables import FIGURES, REFERENCE, latex_of, lines_of
-from training.report_tables import _finite
+from training.report_tables import finite
 from training.tables_page import captions_of, page_of
 from training.team import Precision, Team, team_of
 
@@ -104,7 +104,7 @@ def tables(options: TablesOptions, compared: Sequence[Compared] | None = None) -
         found.about.update(_about(options, runs, team))
         _print_tables(found.rows)
         again = Again(sets, runs, compared, options.boxes, found.rules)
-        content = json.dumps(_finite(found.as_json()), indent=1, allow_nan=False) + "\n"
+        content = json.dumps(finite(found.as_json()), indent=1, allow_nan=False) + "\n"
         _write(options.out / "tables.json", content)  # before the figures: minutes of scoring are safe then
         _write(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
         pictures = draw_all(options.out / "figures", found, again, runs[-1].predictor.network, options.fig3b)
