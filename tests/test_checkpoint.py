@@ -147,7 +147,7 @@ def test_an_exported_network_is_half_as_large_and_says_nearly_the_same(tmp_path,
     network, checkpoint = made()
     save_checkpoint(tmp_path / NAME, checkpoint)
     export(tmp_path, tmp_path / "small.pt")
-    assert "step 7" in capsys.readouterr().out
+    assert "7 steps" in capsys.readouterr().out
     assert (tmp_path / "small.pt").stat().st_size < 0.5 * (tmp_path / NAME).stat().st_size
     back = load_checkpoint(tmp_path / "small.pt")
     assert back.optimiser is None

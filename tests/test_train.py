@@ -261,7 +261,9 @@ def test_a_run_starts_from_anothers_weights(data, tmp_path):
     second = load_checkpoint(train(options(data, tmp_path / "b", slow, steps=1, init=tmp_path / "a")))
     weights = [name for name, _ in PointFlowNet(SETTINGS).named_parameters()]
     assert all(torch.allclose(first.weights[name], second.weights[name], atol=1e-9) for name in weights)
-    assert second.step == 1
+    assert (second.step, second.all_steps) == (1, 2)
+    train(options(data, tmp_path / "b", slow, steps=2, resume=True))
+    assert load_checkpoint(tmp_path / "b").all_steps == 3
 
 
 def test_a_run_stops_after_its_minutes_and_can_go_on(data, tmp_path, capsys):

@@ -38,6 +38,11 @@ class Checkpoint:
     reader: dict[str, Any] = field(default_factory=dict)  # where the shards' reader stands
     facts: dict[str, Any] = field(default_factory=dict)  # how it was made, plain values
 
+    @property
+    def all_steps(self) -> int:
+        """Steps done, with those of the runs that it began from."""
+        return self.step + int(self.facts.get("steps_before", 0))
+
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, half: bool = False) -> None:
     """Write it; the file is there whole or not at all.
@@ -117,7 +122,7 @@ def export(run: Path, out: Path) -> None:
     facts = {**whole.facts, "steps_done": whole.step}
     finished = Checkpoint(whole.settings, whole.weights, whole.step, whole.data_digest, facts=facts)
     save_checkpoint(out, finished, half=True)
-    print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, step {whole.step:,}")
+    print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {whole.all_steps:,} steps")
 
 
 def shipped_checkpoint() -> Path:

@@ -33,6 +33,7 @@ _AHEAD_M, _ASIDE_M = 48.0, 20.0  # of a scene, at most
 _ZOOM_M = 7.0  # half a side of a close-up
 _CHARTS = (("fg_epe", "flow of the car's points (m)"), ("obj_tr_centre", "translation of the car's centre (m)"))
 _LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F3B08", "#999933", "#882255")
+_MARKERS = ("o", "s", "^")  # of lines that share a colour
 
 
 @dataclass(frozen=True)
@@ -335,13 +336,15 @@ def _points_chart(folder: Path, found: Results) -> Picture:
         figure.subplots_adjust(left=0.05, right=0.8, top=0.9, bottom=0.2, wspace=0.18)
         for number, (key, title) in enumerate(_CHARTS, start=1):
             axes = figure.add_subplot(1, 2, number)
-            for colour, line in zip(_cycled(len(lines)), lines, strict=True):
+            for place, line in enumerate(lines):
+                colour = _LINES[place % len(_LINES)]
+                marker = _MARKERS[place // len(_LINES) % len(_MARKERS)]
                 values = [_mean([row["by_points"][k][key] for row in line.rows]) for k in used]
                 if np.isfinite(values).any():
                     style = "-" if line.kind == NETWORK else ":" if line.kind == REFERENCE else "--"
                     width = 2.6 if line.kind == NETWORK else 1.4
                     axes.plot(
-                        range(len(used)), values, style, marker="o", ms=4, color=colour, lw=width, label=line.label
+                        range(len(used)), values, style, marker=marker, ms=5, color=colour, lw=width, label=line.label
                     )
             cars = (f"{name}\n{bins[k]['objects']:,}" for name, k in zip(names, used, strict=True))
             axes.set_xticks(range(len(used)), list(cars), fontsize=8)
@@ -369,10 +372,6 @@ def _log_scale(axes: Any) -> None:
     axes.yaxis.set_major_locator(LogLocator(base=10.0, subs=(1.0, 2.0, 5.0)))
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _cycled(count: int) -> list[str]:
-    return [_LINES[k % len(_LINES)] for k in range(count)]
 
 
 def _mean(values: Sequence[float | None]) -> float:

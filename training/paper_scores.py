@@ -143,7 +143,7 @@ def load_runs(k_runs: Sequence[Path], k_ak_runs: Sequence[Path], team: Team) -> 
         predictor = Predictor(network_of(checkpoint, path), checkpoint.settings, team)
         if out and Rules.of(checkpoint.settings) != Rules.of(out[0].predictor.settings):
             raise InputError(path, f"has another grid or other detections than {out[0].name}", "give runs of one kind")
-        out.append(TrainedRun(name, trained_on, checkpoint.step, predictor))
+        out.append(TrainedRun(name, trained_on, checkpoint.all_steps, predictor))
     return out
 
 

@@ -215,12 +215,14 @@ def open_run(options: TrainOptions, team: Team) -> Run:
     steps = options.steps or max(round(config.epochs * pairs.pairs_in_epoch() / (config.batch * team.size)), 1)
     torch.manual_seed(config.seed)  # every process draws the same first weights
     plain = PointFlowNet(settings)
+    facts: dict[str, Any] = {}
     if options.init is not None and not options.resume:
         start = load_checkpoint(options.init)
         fill(plain, start.weights, options.init)
+        facts["steps_before"] = start.all_steps
     plain = to_training(plain.to(team.device), config)
     optimiser = torch.optim.AdamW(_groups(plain, config.weight_decay), lr=config.learning_rate)
-    run = Run(plain, plain, optimiser, pairs, steps)
+    run = Run(plain, plain, optimiser, pairs, steps, facts=facts)
     torch.manual_seed(config.seed + 1000 * team.rank)
     if options.resume:
         old = load_checkpoint(options.out)
@@ -231,7 +233,7 @@ def open_run(options: TrainOptions, team: Team) -> Run:
         pairs.load_state_dict(old.reader)
         if team.leads:
             set_random_states(old.random)
-        run.step, run.steps = old.step, options.steps or int(old.facts["steps"])
+        run.step, run.steps, run.facts = old.step, options.steps or int(old.facts["steps"]), old.facts
     elif team.leads:
         try:
             options.out.mkdir(parents=True, exist_ok=True)
