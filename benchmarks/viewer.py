@@ -1,7 +1,7 @@
 """How large the viewer's pages are and how fast they answer: a folder of `augkitti view` in, a table out.
 
-`python benchmarks/viewer.py augkitti-view` opens up to eight of its pairs, each in a headless Chromium of its own, drawn
-by the processor alone. Ready: from the start of loading until the first picture is drawn and keys are answered.
+`python benchmarks/viewer.py augkitti-view` opens up to eight of its pairs, each in a headless Chromium of its own,
+drawn by the processor alone. Ready: from the start of loading until the first picture is drawn and keys are answered.
 """
 
 import os

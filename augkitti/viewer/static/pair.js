@@ -300,7 +300,7 @@ function legend(mode, fastest) {
   else if (mode === "range") scale("3 m", "80 m");
   else if (mode === "reflectance") scale("0", "1");
   else scale("highest ring", "lowest");
-  if (columns.removed0 && $("removed").checked) mark("removed", theme.removed);
+  if (columns.removed0 && table.removed.some(Boolean) && $("removed").checked) mark("removed", theme.removed);
   $("legend").innerHTML = marks.join("");
 }
 
