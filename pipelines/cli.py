@@ -270,15 +270,36 @@ def validate(
 @app.command()
 def view(
     folder: Folder = DEFAULT_OUT,
-    pair: Annotated[str | None, typer.Option(help="Pair id. Without: the first.")] = None,
-    out: Annotated[Path, typer.Option(help="Picture to write (PNG).")] = Path("pair.png"),
+    pair: Annotated[str | None, typer.Option(help="Pair id. Without: several, or the first.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            parser=_place,
+            metavar="PATH",
+            help="Folder of pages to write, a picture (x.png), or with --rerun a recording (x.rrd). "
+            "Without: augkitti-view.",
+        ),
+    ] = None,
+    pairs: Annotated[int, typer.Option(min=1, help="Most pages, of pairs evenly spread over the set.")] = 24,
     kitti: Kitti = None,
+    cad: Cad = None,
+    jobs: Jobs = 1,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Send a pair to rerun (pip install rerun-sdk).")] = False,
+    browse: Annotated[bool, typer.Option("--open", help="Open the index page in a browser.")] = False,
 ) -> None:
-    """Draw a pair: bird's-eye view, range image before and after, each car close up."""
+    """Write pages that show pairs in 3D and open from disk; or one picture, or a pair in rerun."""
     with _answers():
-        from pipelines.inspect_set import view_pair
+        from pipelines.view import view as run
+        from pipelines.view import view_in_rerun
 
-        view_pair(folder, pair, out, kitti)
+        if rerun:
+            view_in_rerun(folder, pair, out, kitti)
+            return
+        written = run(folder, pair, out, kitti, cad, pairs, jobs)
+        if browse:
+            import webbrowser
+
+            webbrowser.open(written.resolve().as_uri())
 
 
 @app.command()
