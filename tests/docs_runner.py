@@ -18,6 +18,7 @@ import socket
 import stat
 import sys
 import tomllib
+import traceback
 from importlib import import_module
 from pathlib import Path
 
@@ -84,7 +85,7 @@ def reap() -> None:
 
 
 def answer(talk: socket.socket) -> None:
-    """Let a process take the caller's place and run; tell its exit code once it is gone with all that it started."""
+    """In a process of its own: take the caller's place, run, and tell the exit code."""
     parts, handles = [], []
     while True:
         data, received, _, _ = socket.recv_fds(talk, 1 << 20, 3)
@@ -93,20 +94,25 @@ def answer(talk: socket.socket) -> None:
             break
         parts.append(data)
     call = json.loads(b"".join(parts))
-    child = os.fork()
-    if child == 0:
-        for number, handle in enumerate(handles):
-            os.dup2(handle, number)
-            os.close(handle)
-        os.environ.clear()
-        os.environ.update(call["environment"])
-        os.chdir(call["folder"])
-        sys.exit(run(call["program"], call["words"]))
-    for handle in handles:
+    for number, handle in enumerate(handles):
+        os.dup2(handle, number)
         os.close(handle)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    os.environ.clear()
+    os.environ.update(call["environment"])
+    os.chdir(call["folder"])
+    try:
+        code = run(call["program"], call["words"])
+    except SystemExit as err:
+        code = err.code if isinstance(err.code, int) else int(err.code is not None)
+        if not isinstance(err.code, int | None):
+            print(err.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
     talk.sendall(str(code).encode())
-    os._exit(0)
+    os._exit(0)  # what it started is gone: commands work in one process here
 
 
 def run(program: str, words: list[str]) -> int:
@@ -144,7 +150,8 @@ def parse(app: object, program: str, words: list[str]) -> None:
     try:
         command.make_context(program, words)
     except Exception as err:  # click's, of whichever module it comes from
-        raise SystemExit(f"{program}: {getattr(err, 'message', err)}") from None
+        told = err.format_message() if hasattr(err, "format_message") else err
+        raise SystemExit(f"{program}: {told}") from None
 
 
 def small(words: list[str]) -> list[str]:

@@ -3,8 +3,8 @@
 A block of `sh` or `python` runs as it stands, in its page's folder, by bash with `set -e` or by Python. What stands
 in for what a reader has:
 
-- the home folder is a temporary one, with `kitti` (real scans where `AUGKITTI_TEST_KITTI` has them, else embedded
-  streets in KITTI's layout) and `cars` (two car models);
+- the home folder is a temporary one, with `kitti` (a real drive and two odometry sequences where
+  `AUGKITTI_TEST_KITTI` has them, else embedded streets in KITTI's layout) and `cars` (two car models);
 - the working folder has `aug` and `kitti` as a reader would have them by then: a split set of the embedded street, and
   the streets behind it, and what earlier blocks of its page have made;
 - `augkitti generate` makes at most `PAIRS` pairs; commands work in one process (`--jobs 1`).
@@ -28,6 +28,7 @@ import yaml
 from car_files import write_cars
 
 ROOT = Path(__file__).resolve().parent.parent
+REAL_DRIVE = "raw/2011_09_26/2011_09_26_drive_0002_sync"  # the shortest of the shared ones
 PAIRS = 11  # of three streets, so that they can be split
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 FENCE = re.compile(
@@ -109,7 +110,14 @@ def runner(tmp_path_factory):
         assert code == 0, told
         (streets,) = (path for path in (place / "cache" / "streets").iterdir() if path.is_dir())
         (place / "kitti").symlink_to(streets)
-        (home / "kitti").symlink_to(real if (real / "raw").is_dir() else place / "kitti")
+        if (real / REAL_DRIVE).is_dir() and (real / "odometry").is_dir():
+            day = (home / "kitti" / REAL_DRIVE).parent
+            day.mkdir(parents=True)
+            for path in (real / REAL_DRIVE, *(real / REAL_DRIVE).parent.glob("calib_*.txt")):
+                (day / path.name).symlink_to(path)
+            (home / "kitti" / "odometry").symlink_to(real / "odometry")
+        else:
+            (home / "kitti").symlink_to(streets)
         write_cars(home / "cars")
         yield run, place
         process.stdin.close()
@@ -154,7 +162,7 @@ def test_data_in_a_block_can_be_read(block):
     ("text", "kind", "why"),
     [
         ("augkitti generate --pairs 3", "sh", "--pairs"),
-        ("augkitti generate --n three", "sh", "three"),
+        ("augkitti generate --n three", "sh", "integer"),
         ("augkitti genarate", "sh", "no command"),
         ("pointflownet train --data a", "sh", "--out"),
         ("torchrun --nproc-per-node 2 -m training train --dta a --out b", "sh", "--dta"),
