@@ -8,7 +8,7 @@ CAD ?= ../shared/cad
 STREETS ?= build/streets
 
 .DEFAULT_GOAL := help
-.PHONY: help demo realism test fuzz trust check lint types bench checkpoint table1 tables clean
+.PHONY: help demo docs pictures realism test fuzz trust check lint types bench checkpoint table1 tables clean
 
 help: ## this list
 	@grep -E '^[a-z0-9]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -24,6 +24,13 @@ demo: $(STAMP) ## generate from the embedded street, split, validate, draw a pai
 
 realism: $(STAMP) ## the realism report on the embedded streets, into build/realism (1: not all checks passed)
 	$(BIN)/augkitti realism --resimulate --out build/realism || test $$? -eq 1
+
+docs: $(STAMP) ## the documentation as a site, into build/site; a dead link is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo build/site/index.html
+
+pictures: $(STAMP) ## the pictures of the documentation, drawn anew from the embedded street
+	$(BIN)/python docs/_pictures.py
 
 test: $(STAMP) ## the tests (real scans are used where AUGKITTI_TEST_KITTI has them)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 tests

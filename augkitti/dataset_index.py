@@ -29,6 +29,10 @@ KITTI_LICENCE = (
     "same licence."
 )
 STREET_LICENCE = "Made from procedural streets of this program: no real scans in it; MIT licence."
+_MODELS_LICENCE = (
+    "Virtual cars are shapes of car models, whose names and digests stand in each shard (metadata `augkitti`, "
+    "`cad_models`): `parametric_*` are this program's own, others keep the licences of their authors."
+)
 _LICENCE_IDS = {KITTI_LICENCE: "cc-by-nc-sa-3.0", STREET_LICENCE: "mit"}  # as data set hubs name them
 
 
@@ -203,6 +207,51 @@ def check_contract(path: Path, content: Mapping[str, Any]) -> None:
         raise InputError(path, f"has contract version {version!r}", f"this program reads {CONTRACT_VERSION}: update it")
 
 
+_LOADING = """\
+## Loading
+
+A row is a pair and a row group, so any Parquet reader reads it, pair by pair. `aug` is this folder.
+
+```python
+import augkitti  # records of numpy arrays; its `Dataset` is one for torch's DataLoader, too
+
+for pair in augkitti.open("aug"):
+    print(pair.pair_id, pair.scan0.xyz.shape, pair.flow0.shape)
+
+import datasets  # Hugging Face: finds the splits in the header above
+
+splits = datasets.load_dataset("aug")
+
+import pyarrow.dataset  # and all that read Parquet
+
+ego_motion = pyarrow.dataset.dataset("aug/data").to_table(columns=["pair_id", "ego_motion"])
+
+import polars
+
+objects = polars.scan_parquet("aug/data/*.parquet").select("pair_id", "objects").collect()
+
+import duckdb
+
+speeds = duckdb.sql("select pair_id, unnest(objects).speed from 'aug/data/*.parquet'").fetchall()
+```
+
+Points and flow are flat lists of x, y, z: `reshape(-1, 3)`; matrices are 4 x 4, row by row. Scan 0 is in `velo0`, scan
+1 in `velo1` (x forward, y left, z up, metres): `xyz0 + flow0` lies in `velo1`, ego-motion included. Leave points of
+`flow_status0` 1 out of losses and scores: their motion is not known. The Parquet schema tells what each column means.
+
+## Looking
+
+`augkitti view aug` draws a pair, `augkitti info aug` tells and draws the figures of all of them, `augkitti validate
+aug` checks every pair, and `augkitti croissant aug` writes Croissant metadata. No picture lies in this folder, which
+holds data alone; the program's documentation has some.
+
+## Please cite
+
+Behl, Paschalidou, Donn\u00e9, Geiger: PointFlowNet: Learning Representations for Rigid Motion Estimation from Point
+Clouds, CVPR 2019. Geiger, Lenz, Stiller, Urtasun: Vision meets Robotics: The KITTI Dataset, IJRR 2013.
+"""
+
+
 def write_card(
     folder: Path,
     index: DatasetIndex,
@@ -228,6 +277,7 @@ def card(
     header: dict[str, Any] = {
         "pretty_name": "Augmented KITTI",
         "license": _LICENCE_IDS.get(index.licence, "other"),
+        "tags": ["lidar", "point-cloud", "scene-flow", "kitti"],
         "configs": [
             {
                 "config_name": "default",
@@ -249,6 +299,7 @@ def card(
         f"configuration `{index.configuration_digest[:16]}`.",
         "",
         f"**Licence of the source data.** {index.licence}",
+        *([] if plain else [_MODELS_LICENCE]),
         "",
         "| figure | value |",
         "|---|---|",
@@ -259,21 +310,7 @@ def card(
     ]
     if splits is not None:
         lines += _split_lines(index, splits, divides_recordings)
-    lines += [
-        "## Loading",
-        "",
-        "```python",
-        "import augkitti",
-        "",
-        'for pair in augkitti.open("aug"):  # the folder; records of numpy arrays',
-        "    print(pair.pair_id, pair.scan0.xyz.shape, pair.flow0.shape)",
-        "```",
-        "",
-        "Any Parquet reader works too (a row is a pair and a row group), and so does",
-        '`datasets.load_dataset("aug")`, which finds the splits in the header above.',
-        "",
-    ]
-    return "\n".join(lines)
+    return "\n".join([*lines, _LOADING])
 
 
 def _split_lines(index: DatasetIndex, splits: Mapping[str, Sequence[str]], divides_recordings: bool) -> list[str]:

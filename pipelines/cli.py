@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -314,6 +315,22 @@ def info(
         from pipelines.inspect_set import show_info
 
         show_info(folder, json, out, kitti)
+
+
+@app.command()
+def croissant(
+    folder: Folder = DEFAULT_OUT,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Beside the data set, not in it.")] = Path("croissant.json"),
+    url: Annotated[str | None, typer.Option(help="Of the page that publishes the data set.")] = None,
+    published: Annotated[
+        datetime | None, typer.Option(formats=["%Y-%m-%d"], help="Date to give. Without: today.", show_default=False)
+    ] = None,
+) -> None:
+    """Write Croissant 1.1 metadata (JSON-LD): every shard with its sha256, every column, the splits."""
+    with _answers():
+        from pipelines.inspect_set import describe_set
+
+        describe_set(folder, out, url, (published or datetime.now(UTC)).date())
 
 
 @app.command()

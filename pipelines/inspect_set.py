@@ -1,6 +1,8 @@
 """The commands that look: a data set, a folder of car models or a disk in; tables, pictures and exit codes out."""
 
+import datetime
 import json
+import os
 import sys
 import types
 from collections.abc import Iterator, Sequence
@@ -146,6 +148,33 @@ def split_set(
     console().print(table)
     if splits.divides_recordings:
         print("a recording is divided between splits: for toy sets only")
+
+
+def describe_set(folder: Path, out: Path, url: str | None, published: datetime.date) -> None:
+    """Write Croissant metadata of a data set, with its splits where it has them.
+
+    Raises:
+        InputError: unfinished set, a file inside the set's folder, or one that cannot be written.
+    """
+    from augkitti.croissant import croissant
+    from augkitti.dataset_index import SPLITS_NAME, read_index, write_text
+    from augkitti.remote import is_remote
+    from augkitti.splits import read_splits
+
+    index = read_index(folder)
+    splits = read_splits(folder / SPLITS_NAME).splits if (folder / SPLITS_NAME).is_file() else None
+    address, name = str(folder), folder.name
+    if not is_remote(folder):
+        here, there = folder.resolve(), out.resolve()
+        if there.is_relative_to(here):
+            raise InputError(out, "lies in the data set's folder, which holds data alone", "put it beside that folder")
+        address, name = Path(os.path.relpath(here, there.parent)).as_posix(), here.name
+    text = json.dumps(croissant(index, splits, name, address, published, url), indent=1) + "\n"
+    try:
+        write_text(out, text)
+    except OSError as err:
+        raise InputError(out, f"cannot be written ({err.strerror})", "name another file") from err
+    print(out)
 
 
 def view_pair(folder: Path, pair_id: str | None, picture: Path, kitti: Path | None) -> None:

@@ -9,9 +9,11 @@ import urllib.request
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 from car_files import write_cars
 from tiny_drive import write_drive, write_odometry
+from tiny_shards import write_tiny_set
 from typer.testing import CliRunner
 
 import augkitti
@@ -33,7 +35,7 @@ ACCESS = {"AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any", "AWS_DEFAU
 
 @pytest.fixture(scope="module")
 def server():
-    """A function that makes the server fail every n-th request and tells (asked, failed) since it was last called."""
+    """A function that makes the server fail every n-th request; tells (asked, failed, sent) since its last call."""
     words = [sys.executable, str(Path(__file__).with_name("s3_server.py"))]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         address = f"http://127.0.0.1:{int(process.stdout.readline())}"
@@ -129,7 +131,7 @@ def test_a_run_on_a_store_that_fails_every_tenth_request_gives_the_bytes_of_a_lo
     shown = run("view", out, "--out", tmp_path / "pair.png")
     assert shown.exit_code == 0, shown.output
     train = augkitti.open(out, split="train")
-    asked, failed = server(0)
+    asked, failed, _ = server(0)
     assert failed >= asked // 10 >= 5
     assert run("split", tmp_path / "near", "--ratios", 70, 0, 30).exit_code == 0
     assert digests(as_path(out)) == digests(tmp_path / "near")
@@ -137,6 +139,25 @@ def test_a_run_on_a_store_that_fails_every_tenth_request_gives_the_bytes_of_a_lo
     near = augkitti.open(tmp_path / "near", split="train")
     assert train.pair_ids == near.pair_ids
     np.testing.assert_array_equal(train[0].flow0, near[near.pair_ids[0]].flow0)
+
+
+def test_one_pair_of_a_set_on_a_store_costs_its_row_group_and_its_shards_footer(bucket, server, tmp_path):
+    write_tiny_set(tmp_path / "aug", {"0001": (12,), "0002": (12,)}, tick_step=40)
+    for path in sorted(path for path in (tmp_path / "aug").rglob("*") if path.is_file()):
+        content = path.read_bytes()
+        far = as_path(f"{BUCKET}/aug/{path.relative_to(tmp_path / 'aug').as_posix()}")
+        replace_whole(far, lambda f, c=content: f.write(c))
+    pairs = augkitti.open(f"{BUCKET}/aug")
+    shard = tmp_path / "aug" / pairs.shards[1].path
+    with parquet.ParquetFile(shard) as file:
+        footer, group = file.metadata.serialized_size, file.metadata.row_group(7)
+        row_group = sum(group.column(k).total_compressed_size for k in range(group.num_columns))
+    server(0)
+    far, near = pairs[12 + 7], augkitti.open(tmp_path / "aug")[12 + 7]
+    asked, _, sent = server(0)
+    np.testing.assert_array_equal(far.flow0, near.flow0)
+    assert row_group < sent < row_group + footer + (128 << 10) < shard.stat().st_size / 2
+    assert asked < 12
 
 
 def test_a_run_that_was_cut_off_goes_on_and_a_finished_one_is_refused(local, bucket, run, tmp_path, monkeypatch):
