@@ -191,6 +191,8 @@ def check_other(program: str, words: list[str]) -> int:
 def check_python(words: list[str]) -> int:
     if words == ["-"]:
         compile(sys.stdin.read(), "block", "exec")
+    elif words[:2] == ["-m", "torch.distributed.run"]:
+        return check_other("torchrun", words[2:])
     elif words[0] == "-m" and words[1] in ("pipelines", "training", "augkitti"):
         program, app = {
             "pipelines": ("augkitti", "pipelines.cli"),

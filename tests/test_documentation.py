@@ -134,6 +134,7 @@ def folders(runner):
             made.mkdir(parents=True)
             for name in SHARED:
                 (made / name).symlink_to(place / name)
+            (made / "pipelines").symlink_to(ROOT / "pipelines")  # its script is called from the checkout
         return made
 
     yield folder
