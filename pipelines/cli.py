@@ -72,7 +72,10 @@ Glass = Annotated[Literal["pass", "opaque"] | None, typer.Option(help="Whether p
 Shutter = Annotated[
     Literal["rolling", "snapshot"] | None, typer.Option(help="Each ray at its own firing time, or all at once.")
 ]
-Profile = Annotated[Path | None, typer.Option(help="Scanner profile (JSON, or its folder). Without: KITTI's HDL-64E.")]
+Profile = Annotated[
+    Path | None,
+    typer.Option(help="Scanner profile: hdl32e, or a file (JSON, YAML) or folder. Without: KITTI's HDL-64E."),
+]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings (YAML); see `augkitti config show`.")]
 OnError = Annotated[Literal["skip", "stop"], typer.Option(help="Leave out pairs whose source is unreadable, or stop.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run.")]

@@ -173,10 +173,10 @@ def view_pair(folder: Path, pair_id: str | None, picture: Path, kitti: Path | No
         prepared = [prepared_scan(sequence, f, profile, config, cache_folder())[0] for f in (pair.frame0, pair.frame1)]
     if prepared is None:
         print("no source at hand: give --kitti to see what the cars hide", file=sys.stderr)
-        draw_pair(pair, picture)
+        draw_pair(pair, picture, profile=profile)
     else:
         scan0, scan1 = prepared
-        draw_pair(pair, picture, scan0.scan, scan1.scan, scan0.region, scan0.ground)
+        draw_pair(pair, picture, scan0.scan, scan1.scan, scan0.region, scan0.ground, profile=profile)
     print(picture)
 
 

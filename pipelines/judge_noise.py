@@ -128,7 +128,7 @@ def judge_scans(
     rng = np.random.default_rng(seed)
     parts, tried = [], 0
     for number, (drive, frame) in enumerate(scans):
-        scan = kitti.read_scan(drive, frame)
+        scan = kitti.read_scan(drive, frame, scanner.elevation_rad)
         noise_patches.check_raw(scan, f"{drive.name}, frame {frame}")
         rays = assign_rays(scan, scanner)
         returns, count = noise_patches.judge_returns(
