@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -107,12 +108,19 @@ class StreetScan:
 
 
 def synthesize(
-    out: Path, drives: int, frames: int, seed: int, profile: ScannerProfile, jobs: int = 1
+    out: Path,
+    drives: int,
+    frames: int,
+    seed: int,
+    profile: ScannerProfile,
+    jobs: int = 1,
+    on_drive: Callable[[int], None] | None = None,
 ) -> tuple[Path, ...]:
     """Write drives of `frames` scans each under `out` and return their folders.
 
-    The same arguments give the same bytes, whatever `jobs` is. The whole is written to a temporary folder beside `out`
-    and renamed at the end, so that a run that breaks off leaves nothing half done.
+    The same arguments give the same bytes, whatever `jobs` is; `on_drive` is told of each drive that is done. The whole
+    is written to a temporary folder beside `out` and renamed at the end, so that a run that breaks off leaves nothing
+    half done.
 
     Raises:
         InputError: `out` holds something already or cannot be written, or a count is not positive.
@@ -129,9 +137,13 @@ def synthesize(
             (part / DATE).mkdir(parents=True)
             for name, text in _calibration().items():
                 (part / DATE / name).write_text(text, encoding="utf-8")
-            names = Parallel(n_jobs=jobs)(
+            names = []
+            for name in Parallel(n_jobs=jobs, return_as="generator")(
                 delayed(_write_drive)(part / DATE, index, frames, seed, profile) for index in range(drives)
-            )
+            ):
+                names.append(name)
+                if on_drive is not None:
+                    on_drive(1)
             os.replace(part, out)
         except OSError as err:
             raise InputError(out, f"cannot be written ({err.strerror})", "name another folder, or make room") from err
