@@ -28,11 +28,11 @@ realism: $(STAMP) ## the realism report on the embedded streets, into build/real
 test: $(STAMP) ## the tests (real scans are used where AUGKITTI_TEST_KITTI has them)
 	$(BIN)/python -m pytest -n 2 tests
 
-lint: $(STAMP)
+lint: $(STAMP) ## form: ruff
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(STAMP)
+types: $(STAMP) ## types: mypy, strict
 	$(BIN)/mypy
 
 fuzz: $(STAMP) ## 2,000 damaged files of each format to every reader; prints the table of docs/reliability.md

@@ -231,3 +231,24 @@ def test_a_wheel_holds_every_file_that_the_product_needs(tmp_path):
     wanted = {name for name in tree if not name.endswith(".sh")}  # `make tables` alone runs it
     assert wanted <= packed
     assert {"augkitti/profiles/hdl32e.yaml", "training/checkpoints/small.pt"} <= packed
+
+
+def test_make_check_is_what_ci_runs():
+    (script,) = (ROOT / ".ci").iterdir()
+    assert re.findall(r"^make .*", script.read_text(), flags=re.MULTILINE) == ["make check"]
+    makefile = (ROOT / "Makefile").read_text()
+    assert re.search(r"^check: lint types test ", makefile, flags=re.MULTILINE)
+    named = set(re.findall(r"`make (\w+)`", (ROOT / "CONTRIBUTING.md").read_text()))
+    assert named <= set(re.findall(r"^(\w+):", makefile, flags=re.MULTILINE))
+
+
+def test_every_module_that_the_architecture_names_is_there():
+    text = (ROOT / "docs" / "architecture.md").read_text() + (ROOT / "docs" / "architecture.svg").read_text()
+    there = {
+        path.name
+        for package in ("augkitti", "pipelines", "training", "tests")
+        for path in (ROOT / package).glob("*.py")
+    }
+    named = set(re.findall(r"[a-z_0-9]+\.py", text))
+    assert len(named) > 25
+    assert named <= there
