@@ -34,6 +34,7 @@ class _Manner:
     verbose: bool = False
     json: bool = False  # the command prints JSON: stdout is its alone
     started_s: float = 0.0
+    shows_progress: bool = False
 
 
 _manner = _Manner()
@@ -140,14 +141,26 @@ def progress(total: int | None, what: str) -> Iterator[Callable[[int], None]]:
     """A function to call with how many more are done; shown on stderr with rate and time left.
 
     On a terminal a bar. Elsewhere a plain line after ten seconds, then every half minute: a log shows that it goes on.
+    Within another progress it shows nothing.
 
     Args:
         total: how many there are; None where that is not known.
         what: their name, in the plural.
     """
-    if _manner.quiet:
+    if _manner.quiet or _manner.shows_progress:
         yield lambda done: None
-    elif sys.stderr.isatty() and os.environ.get("TERM") != "dumb":
+        return
+    _manner.shows_progress = True
+    try:
+        with _bar(total, what) as advance:
+            yield advance
+    finally:
+        _manner.shows_progress = False
+
+
+@contextmanager
+def _bar(total: int | None, what: str) -> Iterator[Callable[[int], None]]:
+    if sys.stderr.isatty() and os.environ.get("TERM") != "dumb":
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

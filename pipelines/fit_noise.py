@@ -536,7 +536,7 @@ def _fit_misses(at: RayConditions, missed: npt.NDArray[np.bool_], beams: int, st
     beam = torch.zeros(beams, requires_grad=True)
     optimiser = torch.optim.Adam([*first.parameters(), *second.parameters(), beam], lr=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=0.02, total_steps=steps)
-    for _ in range(steps):
+    for _ in counted(range(steps), steps, "steps"):
         rows = torch.from_numpy(rng.integers(0, len(y), min(32768, len(y))))
         optimiser.zero_grad()
         z = second(torch.nn.functional.softsign(first(x[rows])))[:, 0] + beam[rings[rows]]

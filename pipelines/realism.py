@@ -454,7 +454,8 @@ def judge(
     equal: dict[str, AtEqualCounts] = {}
     drops: dict[str, float] = {}
     if count >= 2:
-        judged = {name: _told_apart(gathered, name, X_real, X, scorer, seed, 3) for name in X}
+        columns = counted(X, len(X), "columns judged")
+        judged = {name: _told_apart(gathered, name, X_real, X, scorer, seed, 3) for name in columns}
         in_place = {name: one for name, one in judged.items() if name != SET}
         boot = bootstrap_auc(in_place, resamples, rng, sorted(set(tracks)))
         boot |= bootstrap_auc({name: one for name, one in judged.items() if name == SET}, resamples, rng)
@@ -464,7 +465,8 @@ def judge(
         else:
             clouds = {name: _clouds(views, rng) for name, views in gathered.columns.items() if views}
             cloud_real = _clouds(real, rng)
-            points_judged = {name: _told_apart(gathered, name, cloud_real, clouds, network, seed, 1) for name in clouds}
+            columns = counted(clouds, len(clouds), "point networks")
+            points_judged = {n: _told_apart(gathered, n, cloud_real, clouds, network, seed, 1) for n in columns}
     if count >= 4:
         beside: dict[str, F64] = {name: X[name] for name in ("full", "common") if name in X}
         equal = at_equal_counts(X_real, beside, tracks, scorer, splits, rng)

@@ -164,6 +164,18 @@ def test_quiet_progress_says_nothing(capsys, monkeypatch):
     assert capsys.readouterr() == ("", "")
 
 
+def test_progress_within_progress_shows_the_outer_one_alone(monkeypatch, capsys):
+    command_line.begin(quiet=False, verbose=False)
+    monkeypatch.setattr(command_line, "_FIRST_LINE_S", -1.0)
+    for _ in command_line.counted([1], 1, "folds"):
+        assert list(command_line.counted([1, 2], 2, "steps")) == [1, 2]
+    assert list(command_line.counted([1], 1, "scans")) == [1]
+    told = capsys.readouterr().err
+    assert "1 of 1 folds" in told
+    assert "steps" not in told
+    assert "1 of 1 scans" in told, "the next one is shown again"
+
+
 def test_json_text_has_null_for_what_is_no_number():
     assert json.loads(command_line.as_json({"a": [float("nan"), 1.0], "b": {"c": float("inf")}})) == {
         "program_version": augkitti.__version__,
