@@ -35,11 +35,11 @@ pictures: $(STAMP) ## the pictures of the documentation, drawn anew from the emb
 test: $(STAMP) ## the tests (real scans are used where AUGKITTI_TEST_KITTI has them)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 tests
 
-lint: $(STAMP)
+lint: $(STAMP) ## form: ruff
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-types: $(STAMP)
+types: $(STAMP) ## types: mypy, strict
 	$(BIN)/mypy
 
 fuzz: $(STAMP) ## 2,000 damaged files of each format to every reader; prints the table of docs/reliability.md

@@ -26,7 +26,7 @@ from augkitti.scan_pair import (
     ObjectRecord,
     Scan,
 )
-from augkitti.scanner import assign_rays, load_profile
+from augkitti.scanner import ScannerProfile, assign_rays, load_profile
 
 # Okabe and Ito's palette: told apart with any colour vision.
 CAR_COLOURS = ("#0072B2", "#E69F00", "#CC79A7", "#009E73", "#56B4E9", "#F0E442")
@@ -49,6 +49,7 @@ def draw_pair(
     region: DrivableRegion | None = None,
     ground: GroundMap | None = None,
     models: Sequence[CarModel] | None = None,
+    profile: ScannerProfile | None = None,
 ) -> None:
     """One PNG of a pair.
 
@@ -64,12 +65,14 @@ def draw_pair(
         region: where cars may stand, of scan 0.
         ground: of scan 0; heights are then above the local ground, else above 1.73 m under the scanner.
         models: CAD models; a virtual car whose model is among them gets its outline.
+        profile: the scanner; without: KITTI's.
 
     Raises:
         InputError: matplotlib is missing, or the picture cannot be written.
     """
     cars = [(row, item) for row, item in enumerate(pair.objects) if item.origin == "virtual" and item.pose0 is not None]
     named = {model.name: model for model in models or ()}
+    scanner = profile or load_profile()
     removed = np.zeros((0, 3)) if source0 is None else source0.xyz[np.isin(source0.row, pair.scan0.removed)]
     images: list[tuple[str, Scan | AugmentedScan]] = []
     for k, source, after in ((0, source0, pair.scan0), (1, source1, pair.scan1)):
@@ -86,7 +89,7 @@ def draw_pair(
         _draw_from_above(figure.add_subplot(layout[0]), pair, cars, removed, region, ground)
         _draw_cars(figure, layout[1], pair, cars, removed, named)
         for slot, (title, scan) in enumerate(images, start=2):
-            _draw_range_image(figure.add_subplot(layout[slot]), scan, cars, title, slot == len(rows) - 1)
+            _draw_range_image(figure.add_subplot(layout[slot]), scan, cars, title, slot == len(rows) - 1, scanner)
 
 
 @contextmanager
@@ -494,25 +497,30 @@ def _outline(model: CarModel, towards: F64) -> F64:
 # --- range images --------------------------------------------------------------------------------------------------
 
 
-def range_image(xyz: Array, ring: Array, columns: int = _COLUMNS) -> npt.NDArray[np.float64]:
-    """Nearest range (64, columns) metres by ring and azimuth, from 180 degrees left to 180 right; NaN where nothing."""
+def range_image(xyz: Array, ring: Array, columns: int = _COLUMNS, beams: int = 64) -> npt.NDArray[np.float64]:
+    """Nearest range (beams, columns) metres by ring and azimuth, 180 degrees left to 180 right; NaN where nothing."""
     distance = np.sqrt((np.asarray(xyz, dtype=np.float64) ** 2).sum(axis=1))
     azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
     column = np.clip(((np.pi - azimuth) / (2.0 * np.pi) * columns).astype(np.int64), 0, columns - 1)
-    image = np.full((max(64, int(ring.max(initial=0)) + 1), columns), np.inf)
+    image = np.full((max(beams, int(ring.max(initial=0)) + 1), columns), np.inf)
     np.minimum.at(image, (ring.astype(np.int64), column), distance)
     image[np.isinf(image)] = np.nan
     return image
 
 
 def _draw_range_image(
-    axes: Any, scan: Scan | AugmentedScan, cars: list[tuple[int, ObjectRecord]], title: str, last: bool
+    axes: Any,
+    scan: Scan | AugmentedScan,
+    cars: list[tuple[int, ObjectRecord]],
+    title: str,
+    last: bool,
+    profile: ScannerProfile,
 ) -> None:
     import matplotlib as mpl
     from matplotlib.patches import Rectangle
 
-    ring = scan.ring if isinstance(scan, AugmentedScan) else assign_rays(scan, load_profile()).ring
-    image = range_image(scan.xyz, ring)
+    ring = scan.ring if isinstance(scan, AugmentedScan) else assign_rays(scan, profile).ring
+    image = range_image(scan.xyz, ring, beams=profile.beams)
     colours = mpl.colormaps["cividis_r"].with_extremes(bad="white")
     shown = axes.imshow(
         np.log(image),

@@ -36,7 +36,7 @@ from augkitti.remote import as_source
 from augkitti.scan_pair import Bool, LabelledBox, Scan, ScanKind, ScanPair
 
 SIDECAR = "augkitti_source.json"
-MIN_POINTS = 1000  # fewer valid points are no revolution of a 64-beam scanner
+MIN_POINTS = 1000  # fewer valid points are no revolution, be it of 16 beams
 
 _DEFAULT_PERIOD_S = 0.1035  # scanner.md: a revolution takes 103.2 to 103.6 ms
 _PACKET_AFTER_MIDDLE_S = 0.017  # scanner.md: the median delay of a scan's OXTS packet; used without OXTS timestamps
@@ -166,7 +166,7 @@ def read_scan_rows(path: Path) -> Array:
     return _rows_of(content, path)
 
 
-def read_scan(sequence: Sequence, frame: int) -> Scan:
+def read_scan(sequence: Sequence, frame: int, elevation_rad: F64 | None = None) -> Scan:
     """One revolution, with rows that are no measurement left out.
 
     `time_s` is UTC epoch for raw drives: line `frame` of `velodyne_points/timestamps.txt` (blank lines count). Without
@@ -174,12 +174,17 @@ def read_scan(sequence: Sequence, frame: int) -> Scan:
     Odometry: line `frame` of `times.txt`, else 0.1 s x frame. `period_s` is end minus start of a raw scan, else the
     distance to the next line of the times, else 103.5 ms.
 
+    Args:
+        sequence: one of `open_root(...).sequences`.
+        frame: the scan's number.
+        elevation_rad: (beams,) of the scanner, highest first, to tell a file that was cut; without: KITTI's.
+
     Raises:
         InputError: the file is missing, empty, cut short, too small, a camera-view crop, its reflectance is not within
             0 and 1, or its line of the timestamps is missing or malformed.
     """
     path = sequence.scan_path(frame)
-    return _scan_of(read_scan_rows(path), sequence, frame)
+    return _scan_of(read_scan_rows(path), sequence, frame, elevation_rad)
 
 
 def scan_digest(sequence: Sequence, frame: int) -> str:
@@ -238,10 +243,10 @@ def scan_time(sequence: Sequence, frame: int) -> tuple[float, float]:
     start, end = _stamp(stamps / "timestamps_start.txt", frame), _stamp(stamps / "timestamps_end.txt", frame)
     if start is None or end is None:
         return middle, _DEFAULT_PERIOD_S
-    if not 0.05 < end - start < 0.2:
+    if not 0.04 < end - start < 0.25:
         raise InputError(
             stamps / "timestamps_end.txt",
-            f"line {frame + 1}: {end - start:.3f} s after the start of the scan, a revolution takes 0.1 s",
+            f"line {frame + 1}: {end - start:.3f} s after the start of the scan, a revolution takes 0.05 to 0.2 s",
             _FETCH,
         )
     return middle, end - start
@@ -473,7 +478,7 @@ def _rows_of(content: bytes, path: Path) -> Array:
     return np.frombuffer(content, dtype="<f4").reshape(-1, 4)
 
 
-def _scan_of(rows: Array, sequence: Sequence, frame: int) -> Scan:
+def _scan_of(rows: Array, sequence: Sequence, frame: int, elevation_rad: F64 | None) -> Scan:
     path = sequence.scan_path(frame)
     valid = valid_rows(rows)
     row = np.arange(len(rows), dtype=np.int32) if valid.all() else np.flatnonzero(valid).astype(np.int32)
@@ -494,7 +499,10 @@ def _scan_of(rows: Array, sequence: Sequence, frame: int) -> Scan:
             path, "does not see all round: a camera-view crop?", "take the whole scans of the KITTI download"
         )
     last = xyz[-_LAST_POINTS:].astype(np.float64)
-    if np.median(sm.arctan2(last[:, 2], sm.hypot(last[:, 0], last[:, 1]))) > _LAST_ELEVATION_RAD:
+    lowest = _LAST_ELEVATION_RAD  # a scanner that looks down less than KITTI's ends higher
+    if elevation_rad is not None:
+        lowest = max(lowest, float(elevation_rad[3 * len(elevation_rad) // 4]))
+    if np.median(sm.arctan2(last[:, 2], sm.hypot(last[:, 0], last[:, 1]))) > lowest:
         raise InputError(
             path, f"is cut short: {len(rows)} points, and the lowest quarter of the beams is missing", _FETCH
         )

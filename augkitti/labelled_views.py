@@ -138,7 +138,7 @@ def vehicle_views(
             if not labels:
                 continue
             seen.add((sequence.recording, frame))
-            scan = kitti.read_scan(sequence, frame)
+            scan = kitti.read_scan(sequence, frame, profile.elevation_rad)
             rayed = RayedScan(scan, assign_rays(scan, profile))
             for label in labels:
                 track = track_of[sequence.recording, label.id]

@@ -1,14 +1,15 @@
 """Scanner profile and rays: a scan's points in, the ring and tick of each point and every fired ray out.
 
-Conventions (scanner.md section 1, measured on real KITTI scans): the encoder has 4000 ticks a revolution; at one firing
-all 64 beams share a tick t; beam b then looks along `alpha = 2 pi / 4000 (t + tick_offset_b) + azimuth_b`, from
-`(-side_b sin alpha, side_b cos alpha, height_b)`. The scanner turns clockwise: time runs with decreasing tick, from
-t = 1999 over 0 (straight ahead, the scan's middle) to t = 2000.
+Conventions (scanner.md section 1, measured on real KITTI scans): the encoder has L ticks a revolution (KITTI: 4000); at
+one firing all beams (64) share a tick t; beam b then looks along `alpha = 2 pi / L (t + tick_offset_b) + azimuth_b`,
+from `(-side_b sin alpha, side_b cos alpha, height_b)`. The scanner turns clockwise: time runs with decreasing tick,
+from the tick before the seam (1999) over 0 (straight ahead, the scan's middle) to the seam (2000).
 """
 
 import hashlib
 import json
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -21,12 +22,29 @@ from augkitti import same_math as sm
 from augkitti.errors import InputError
 from augkitti.frames import F64, wrap_angle
 from augkitti.scan_pair import I32, NO_TICK, U8, U16, Bool, Scan, ScanRays
+from augkitti.yaml_text import read_yaml
 
 DEFAULT_PROFILE = "hdl64e_kitti"
+SHIPPED = {DEFAULT_PROFILE: "hdl64e_kitti.json", "hdl32e": "hdl32e.yaml"}  # name: file in `profiles`
 PROFILE_FILE = "profile.json"  # in the folder of a fitted profile
 _ON_RAY_M = 0.002  # scanner.md: p99.9 of the distance of a point to its ray is 0.78 mm; 2 mm settles the wrap trap
 _MIN_POINTS_OF_A_TICK = 4  # a fired tick has about 50 returns; fewer are stray points
-_DEFAULT_FIRINGS = 2150  # scanner.md: 2146 to 2164 fired ticks a scan
+_DEFAULT_PERIOD_S = 0.1034  # a revolution of KITTI's scanner (scanner.md: 103.2 to 103.6 ms); profiles may say another
+_PER_BEAM = ("height_m", "side_m", "azimuth_rad", "tick_offset", "range_phase_mm", "range_bias_mm")
+_NUMBERS = {  # key: the largest that it may be; above 0
+    "firing_period_s": 1.0,
+    "range_quantum_m": 1.0,
+    "coordinate_quantum_m": 1.0,
+    "reflectance_quantum": 1.0,
+    "min_range_m": 1e4,
+    "max_range_m": 1e4,
+}
+_NEEDED = {
+    *("name", "version", "source", "lattice_size", "seam_tick", "shadow_first_ring", "elevation_rad"),
+    *("never_returned_ticks", *_NUMBERS, *_PER_BEAM),
+}
+_OPTIONAL = {"period_s", "noise", "sensor", "spin", "fit"}  # the last three are notes, read by people
+_SEE = "see docs/scanners.md, and the shipped profile hdl32e.yaml, whose comments explain each key"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +57,7 @@ class ScannerProfile:
     lattice_size: int
     seam_tick: int
     firing_period_s: float
+    period_s: float  # of a revolution, where a scan is made and not read
     range_quantum_m: float
     coordinate_quantum_m: float
     reflectance_quantum: float
@@ -65,6 +84,22 @@ class ScannerProfile:
         """Azimuth between two encoder ticks."""
         return 2.0 * np.pi / self.lattice_size
 
+    @property
+    def firings(self) -> int:
+        """Firings a revolution, to fifties: which of the lattice's ticks are fired differs from scan to scan."""
+        return max(50, 50 * round(self.period_s / self.firing_period_s / 50.0))
+
+    @property
+    def ring_step_rad(self) -> float:
+        """Mean angle between neighbouring beams, to half a milliradian: 0.0075 of KITTI's scanner."""
+        steps = float(self.elevation_rad[0] - self.elevation_rad[-1]) / max(1, self.beams - 1)
+        return max(1, round(steps / 5e-4)) * 5e-4
+
+    @property
+    def reflectance_steps(self) -> int:
+        """The largest reflectance that simulated returns have, 0.99, in the scanner's steps."""
+        return max(1, round(0.99 / self.reflectance_quantum))
+
     @cached_property
     def lattice_azimuth_rad(self) -> F64:
         """Direction (beams, lattice_size) in which each beam looks at each tick, radians in [-pi, pi)."""
@@ -89,85 +124,165 @@ class ScannerProfile:
         return hashlib.sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()
 
 
-def load_profile(path: Path | None = None) -> ScannerProfile:
-    """The shipped profile of KITTI's HDL-64E, or the one in a JSON file of the same form or in a profile's folder.
+def load_profile(path: Path | str | None = None) -> ScannerProfile:
+    """The shipped profile of KITTI's HDL-64E, a shipped one by name (`hdl32e`), or a file's: JSON, YAML or a folder.
+
+    A YAML file (`.yaml`, `.yml`) may say one number for all beams where JSON has a list. A profile's folder holds it as
+    `profile.json`. A shipped name comes before a file of that name: write `./hdl32e` for the file.
 
     Raises:
-        InputError: the file is missing, not JSON, or a key is missing or of the wrong size.
+        InputError: the file is missing or unreadable, or a key is missing, unknown, out of range or of the wrong size.
     """
-    if path is None:
-        text = (resources.files("augkitti") / "profiles" / f"{DEFAULT_PROFILE}.json").read_text(encoding="utf-8")
-        return profile_from_content(json.loads(text), DEFAULT_PROFILE)
-    try:
-        file = Path(path) / PROFILE_FILE if Path(path).is_dir() else Path(path)
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as err:
-        remedy = "give a profile JSON file, or a folder with profile.json in it"
-        raise InputError(path, f"not readable as a scanner profile ({err})", remedy) from err
-    return profile_from_content(content, str(path))
+    if path is None or is_shipped(path):
+        name = DEFAULT_PROFILE if path is None else str(path)
+        with resources.as_file(resources.files("augkitti") / "profiles" / SHIPPED[name]) as file:
+            return profile_from_content(_content_of_file(file), name)
+    file = Path(path) / PROFILE_FILE if Path(path).is_dir() else Path(path)
+    return profile_from_content(_content_of_file(file), str(path))
+
+
+def is_shipped(path: Path | str) -> bool:
+    """Whether this is the name of a profile that comes with the program, and no path."""
+    return str(path) in SHIPPED
+
+
+def _content_of_file(file: Path) -> Any:
+    """The content of a profile's file, with lists where a YAML file has one number for all beams.
+
+    Raises:
+        InputError: it is unreadable, or has a key that no profile has.
+    """
+    remedy = f"give a profile (JSON, YAML), a folder with {PROFILE_FILE} in it, or a name: {', '.join(sorted(SHIPPED))}"
+    if file.suffix in (".yaml", ".yml"):
+        content = read_yaml(file, remedy)
+    else:
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as err:
+            raise InputError(file, f"not readable as a scanner profile ({err})", remedy) from err
+    if not isinstance(content, dict):
+        raise InputError(file, "not a scanner profile: no keys and values", remedy)
+    for key in content:
+        if key not in _NEEDED | _OPTIONAL:
+            near = get_close_matches(str(key), sorted(_NEEDED | _OPTIONAL), n=1)
+            meant = f"did you mean `{near[0]}`? " if near else ""
+            raise InputError(file, f"key `{key}` is unknown", f"{meant}{_SEE}")
+    beams = len(content["elevation_rad"]) if isinstance(content.get("elevation_rad"), list) else 0
+    for key in _PER_BEAM:
+        if isinstance(content.get(key), int | float) and not isinstance(content[key], bool):
+            content[key] = [content[key]] * beams
+    if content.get("never_returned_ticks") == []:
+        content["never_returned_ticks"] = [[] for _ in range(beams)]
+    return content
 
 
 def profile_from_content(content: Any, where: str) -> ScannerProfile:
-    """A profile from the parsed JSON of its file, or of a shard's metadata; `where` names it in errors."""
+    """A profile from the parsed content of its file, or of a shard's metadata; `where` names it in errors.
+
+    Raises:
+        InputError: a key is missing, out of range or of the wrong size; names the key.
+    """
     if not isinstance(content, dict):
-        raise InputError(where, "not a scanner profile", "give a profile JSON file")
+        raise InputError(where, "not a scanner profile", f"give a profile; {_SEE}")
+    missing = sorted(_NEEDED - set(content))
+    if missing:
+        raise InputError(where, f"key `{missing[0]}` is missing from the scanner profile", _SEE)
+    key = ""
     try:
-        elevation = np.asarray(content["elevation_rad"], dtype=np.float64)
-        beams, lattice = len(elevation), int(content["lattice_size"])
+        key = "elevation_rad"
+        elevation = np.asarray(content[key], dtype=np.float64)
+        if not (elevation.ndim == 1 and 1 <= len(elevation) <= 255 and (np.abs(elevation) <= np.pi / 2.0).all()):
+            raise ValueError("needs 1 to 255 numbers from -pi/2 to pi/2, one a beam")
+        if not (np.diff(elevation) < 0).all():
+            raise ValueError("must fall from beam to beam: the highest first")
+        beams = len(elevation)
 
-        def column(key: str, largest: float, scale: float = 1.0) -> F64:
-            values = np.asarray(content[key], dtype=np.float64)
-            if values.shape != (beams,) or not (np.abs(values) <= largest).all():  # NaN is no number here
-                raise ValueError(f"`{key}` needs {beams} numbers from {-largest:g} to {largest:g}, one a beam")
-            return values * scale
-
-        def number(key: str, largest: float) -> float:
-            value = float(content[key])
-            if not 0.0 < value <= largest:
-                raise ValueError(f"`{key}` is not above 0 and up to {largest:g}")
+        def whole(first: int, last: int) -> int:
+            value = int(content[key])
+            if not first <= value <= last or value != content[key]:
+                raise ValueError(f"must be a whole number from {first} to {last}")
             return value
 
-        if not (1 <= beams <= 255 and beams < lattice < NO_TICK and (np.diff(elevation) < 0).all()):
-            raise ValueError("`elevation_rad` must fall from beam to beam, 1 to 255 beams, fewer than 65535 ticks")
-        if not 0 <= int(content["seam_tick"]) < lattice or not 0 <= int(content["shadow_first_ring"]) <= beams:
-            raise ValueError("`seam_tick` or `shadow_first_ring` is no tick or beam of it")
-        shadow = content["never_returned_ticks"]
-        if len(shadow) != beams:
-            raise ValueError(f"`never_returned_ticks` needs {beams} lists, one a beam")
-        blind = np.zeros((beams, lattice), dtype=bool)
-        for ring, intervals in enumerate(shadow):
-            for first, last in intervals:
-                if not 0 <= first <= last < lattice:
-                    raise ValueError(f"`never_returned_ticks` of beam {ring} leaves 0 to {lattice - 1}")
-                blind[ring, first : last + 1] = True
-        blind[: int(content["shadow_first_ring"])] = False
-        return ScannerProfile(
-            name=str(content["name"]),
-            version=int(content["version"]),
-            source=str(content["source"]),
-            lattice_size=lattice,
-            seam_tick=int(content["seam_tick"]),
-            firing_period_s=number("firing_period_s", 1.0),
-            range_quantum_m=number("range_quantum_m", 1.0),
-            coordinate_quantum_m=number("coordinate_quantum_m", 1.0),
-            reflectance_quantum=number("reflectance_quantum", 1.0),
-            min_range_m=number("min_range_m", 1e4),
-            max_range_m=number("max_range_m", 1e4),
-            shadow_first_ring=int(content["shadow_first_ring"]),
-            elevation_rad=column("elevation_rad", np.pi / 2.0),
-            height_m=column("height_m", 100.0),
-            side_m=column("side_m", 100.0),
-            azimuth_rad=column("azimuth_rad", 2.0 * np.pi),
-            tick_offset=column("tick_offset", float(lattice)).astype(np.int32),
-            range_phase_m=column("range_phase_mm", 1e4, 1e-3),
-            range_bias_m=column("range_bias_mm", 1e4, 1e-3),
-            blind=blind,
-            content=content,
-        )
-    except KeyError as err:
-        raise InputError(where, f"key {err} is missing from the scanner profile", "see the shipped profile") from err
+        def above_0(value: Any, largest: float) -> float:
+            number = float(value)
+            if not 0.0 < number <= largest:  # NaN is no number here
+                raise ValueError(f"must be a number above 0 and up to {largest:g}")
+            return number
+
+        def column(largest: float, scale: float = 1.0) -> F64:
+            values = np.asarray(content[key], dtype=np.float64)
+            if values.shape != (beams,) or not (np.abs(values) <= largest).all():
+                raise ValueError(f"needs {beams} numbers from {-largest:g} to {largest:g}, one a beam")
+            return values * scale
+
+        key = "version"
+        version = whole(0, 1_000_000)
+        key = "lattice_size"
+        lattice = whole(beams + 1, NO_TICK - 1)
+        key = "seam_tick"
+        seam = whole(0, lattice - 1)
+        key = "shadow_first_ring"
+        shadow_first = whole(0, beams)
+        numbers: dict[str, float] = {}
+        for key, largest in _NUMBERS.items():
+            numbers[key] = above_0(content[key], largest)
+        key = "period_s"
+        period = above_0(content.get(key, _DEFAULT_PERIOD_S), 1.0)
+        key = "max_range_m"
+        if numbers[key] <= numbers["min_range_m"]:
+            raise ValueError("must be above `min_range_m`")
+        key = "lattice_size"
+        apart = 2.0 * np.pi / lattice * numbers["min_range_m"]
+        if apart < numbers["coordinate_quantum_m"]:
+            raise ValueError(
+                f"ticks lie {1e3 * apart:.2g} mm apart at `min_range_m`, closer than `coordinate_quantum_m`: a point "
+                "would not tell its tick; take fewer ticks"
+            )
+        columns: dict[str, F64] = {}
+        limits = (100.0, 100.0, 2.0 * np.pi, float(lattice), 1e4, 1e4)
+        for key, largest in zip(_PER_BEAM, limits, strict=True):
+            columns[key] = column(largest, 1e-3 if key.endswith("_mm") else 1.0)
+        key = "never_returned_ticks"
+        blind = _blind(content[key], beams, lattice)
+        blind[:shadow_first] = False
     except (TypeError, ValueError, OverflowError, MemoryError) as err:
-        raise InputError(where, f"not a scanner profile: {err}", "see the shipped profile") from err
+        raise InputError(where, f"key `{key}` of the scanner profile: {err}", _SEE) from err
+    return ScannerProfile(
+        name=str(content["name"]),
+        version=version,
+        source=str(content["source"]),
+        lattice_size=lattice,
+        seam_tick=seam,
+        period_s=period,
+        **numbers,
+        shadow_first_ring=shadow_first,
+        elevation_rad=elevation,
+        height_m=columns["height_m"],
+        side_m=columns["side_m"],
+        azimuth_rad=columns["azimuth_rad"],
+        tick_offset=columns["tick_offset"].astype(np.int32),
+        range_phase_m=columns["range_phase_mm"],
+        range_bias_m=columns["range_bias_mm"],
+        blind=blind,
+        content=content,
+    )
+
+
+def _blind(shadow: Any, beams: int, lattice: int) -> Bool:
+    """(beams, lattice) from runs (first, last) of ticks, a list a beam.
+
+    Raises:
+        ValueError: another number of lists, or a run that leaves the lattice.
+    """
+    if not isinstance(shadow, list) or len(shadow) != beams:
+        raise ValueError(f"needs {beams} lists, one a beam")
+    blind = np.zeros((beams, lattice), dtype=bool)
+    for ring, intervals in enumerate(shadow):
+        for first, last in intervals:
+            if not 0 <= first <= last < lattice:
+                raise ValueError(f"beam {ring} leaves 0 to {lattice - 1}")
+            blind[ring, first : last + 1] = True
+    return blind
 
 
 def ray_lines(profile: ScannerProfile, ring: U8, azimuth_rad: F64, elevation_rad: F64) -> tuple[F64, F64]:
@@ -244,8 +359,8 @@ def assign_rays(scan: Scan, profile: ScannerProfile) -> ScanRays:
     is stray. A stray point keeps a ray of its own, without a tick, so that it can still be hidden by a car.
 
     Compensated scans have no exact ticks. Approximation: a point's ray runs from the beam's origin through the point;
-    where the azimuth step between neighbours of a ring shows missing returns (1.5 steps of 360 / 2150 degrees or
-    more), rays are filled in evenly, their elevation interpolated relative to the beam table.
+    where the azimuth step between neighbours of a ring shows missing returns (1.5 steps of a firing, 360 / 2150
+    degrees, or more), rays are filled in evenly, their elevation interpolated relative to the beam table.
     """
     xyz = scan.xyz.astype(np.float64)
     if scan.kind == "compensated":
@@ -352,7 +467,7 @@ def _best_ring(xyz: F64, profile: ScannerProfile) -> tuple[U8, npt.NDArray[np.in
 def _compensated_rays(xyz: F64, profile: ScannerProfile) -> ScanRays:
     ring = _rings_by_run(xyz, profile)
     azimuth, elevation = _line_through(xyz, ring, profile)
-    step = 2.0 * np.pi / _DEFAULT_FIRINGS
+    step = 2.0 * np.pi / profile.firings
     order = np.lexsort((azimuth, ring))
     rings, azimuths, elevations, points = [], [], [], []
     for beam in range(profile.beams):

@@ -30,7 +30,6 @@ from augkitti.scan_pair import GLASS, LAMP, MEASURED, OTHER, PAINT, THROUGH_GLAS
 from augkitti.scanner import ScannerProfile
 
 _FIRINGS = 2150  # azimuth bins of a noise field: one a firing
-_RING_STEP_RAD = 0.0075  # between beams, between that of the upper and of the lower block (scanner.md section 1)
 _LATE = 4.0 / 3.0  # stray ranges lie from a third of the most before the surface to the most behind it
 _MOST_SHOT_M = 0.04  # contract, invariant 4 allows 0.25 m in all: biases, relief and strays take 0.21 m of it
 _MOST_STEPS = 12  # of a frame's half width: beside the scanner it would cover the car
@@ -200,7 +199,7 @@ def simulate_returns(
     model = noise_model(profile)
     count = len(hits.ray)
     ring, azimuth = rays.ray_ring[hits.ray], rays.ray_azimuth_rad[hits.ray]
-    grid = FieldGrid(ring, azimuth)
+    grid = FieldGrid(ring, azimuth, profile.ring_step_rad)
     chance = grid.draw(model.body_clump, rng)
     pane_chance = grid.draw(model.glass_clump, rng)
     relief = grid.draw_smooth(model.relief.firing, model.relief.beam, rng)
@@ -314,7 +313,7 @@ def _through_glass(depth: F64, model: NoiseModel, profile: ScannerProfile) -> F6
 
 
 def _in_steps(value: F64, profile: ScannerProfile) -> F64:
-    steps = np.clip(np.rint(value / profile.reflectance_quantum), 1, 99)
+    steps = np.clip(np.rint(value / profile.reflectance_quantum), 1, profile.reflectance_steps)
     return np.asarray(steps * profile.reflectance_quantum)
 
 
@@ -330,7 +329,8 @@ def _shape_error(inside: Bool, relief: F64, stray: F64, luck: F64, model: NoiseM
 class FieldGrid:
     """Draws correlated chance on the patch of (beam, firing) cells that a car covers."""
 
-    def __init__(self, ring: U8, azimuth_rad: F64) -> None:
+    def __init__(self, ring: U8, azimuth_rad: F64, ring_step_rad: float) -> None:
+        self.ring_step_rad = ring_step_rad
         self.empty = len(ring) == 0
         if self.empty:
             return
@@ -359,7 +359,7 @@ class FieldGrid:
         """Which rays lie within an angle of a chosen one along beams and firings, one step at least."""
         field = np.zeros(self.shape, dtype=np.uint8)
         field[self.row[chosen], self.column[chosen]] = 1
-        for axis, step in ((0, _RING_STEP_RAD), (1, 2.0 * np.pi / _FIRINGS)):
+        for axis, step in ((0, self.ring_step_rad), (1, 2.0 * np.pi / _FIRINGS)):
             reach = min(max(int(angle_rad / step + 0.5), 1), _MOST_STEPS)
             field = maximum_filter1d(field, 2 * reach + 1, axis=axis)
         return np.asarray(field[self.row, self.column] > 0)

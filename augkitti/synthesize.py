@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -42,7 +43,7 @@ from augkitti.raycast import MeshCaster, cast_car, rays_near
 from augkitti.scan_pair import I16, U8, U16, Bool, ScanRays
 from augkitti.scanner import ScannerProfile, azimuth_time, fire_rays, ray_lines
 from augkitti.seeds import generator
-from augkitti.sensor_noise import CarLook, quantise_range, simulate_returns
+from augkitti.sensor_noise import CarLook, noise_model, quantise_range, simulate_returns
 from augkitti.street import Body, Street, body_poses, build_street, scanner_poses
 from augkitti.street_objects import ASPHALT, GRASS, KERB, MARKING, PAVEMENT
 
@@ -50,13 +51,15 @@ METHOD = "street 3"  # part of the digest: raise it when what is drawn or how it
 DATE = "2000_01_01"  # a day on which KITTI recorded nothing
 ROAD, SIDEWALK, LAND = 1, 2, 3
 
-_PERIOD_S = 0.1034
 _CLOTHES_RETURN = 0.94
 _SEE_M = 85.0
 _LABEL_M = 75.0  # KITTI's annotators went about this far
 _START = datetime(2000, 1, 1, 12, 0, 1, tzinfo=UTC)
 _T_VELO_IMU = np.array([[1.0, 0, 0, -0.81], [0, 1.0, 0, 0.32], [0, 0, 1.0, -0.8], [0, 0, 0, 1.0]])
-_FRINGE_TICKS, _FRINGE_RETURN = 40, 0.5  # real scans: beams 44 to 63 lose 3 to 13 % of all rays beside the shadow
+_FRINGE, _FRINGE_RETURN = (
+    0.01,
+    0.5,
+)  # of a turn; real scans: beams 44 to 63 lose 3 to 13 % of all rays beside the shadow
 _FOCAL, _CENTRE, _IMAGE = 720.0, (610.0, 172.0), (1242, 375)
 _CAMERA_AZIMUTH = (-float(sm.arctan((_IMAGE[0] - _CENTRE[0]) / _FOCAL)), float(sm.arctan(_CENTRE[0] / _FOCAL)))
 
@@ -105,12 +108,19 @@ class StreetScan:
 
 
 def synthesize(
-    out: Path, drives: int, frames: int, seed: int, profile: ScannerProfile, jobs: int = 1
+    out: Path,
+    drives: int,
+    frames: int,
+    seed: int,
+    profile: ScannerProfile,
+    jobs: int = 1,
+    on_drive: Callable[[int], None] | None = None,
 ) -> tuple[Path, ...]:
     """Write drives of `frames` scans each under `out` and return their folders.
 
-    The same arguments give the same bytes, whatever `jobs` is. The whole is written to a temporary folder beside `out`
-    and renamed at the end, so that a run that breaks off leaves nothing half done.
+    The same arguments give the same bytes, whatever `jobs` is; `on_drive` is told of each drive that is done. The whole
+    is written to a temporary folder beside `out` and renamed at the end, so that a run that breaks off leaves nothing
+    half done.
 
     Raises:
         InputError: `out` holds something already or cannot be written, or a count is not positive.
@@ -127,9 +137,13 @@ def synthesize(
             (part / DATE).mkdir(parents=True)
             for name, text in _calibration().items():
                 (part / DATE / name).write_text(text, encoding="utf-8")
-            names = Parallel(n_jobs=jobs)(
+            names = []
+            for name in Parallel(n_jobs=jobs, return_as="generator")(
                 delayed(_write_drive)(part / DATE, index, frames, seed, profile) for index in range(drives)
-            )
+            ):
+                names.append(name)
+                if on_drive is not None:
+                    on_drive(1)
             os.replace(part, out)
         except OSError as err:
             raise InputError(out, f"cannot be written ({err.strerror})", "name another folder, or make room") from err
@@ -153,15 +167,15 @@ def content_digest(root: Path) -> str:
     return digest.hexdigest()
 
 
-def drive_street(seed: int, index: int, frames: int) -> Street:
-    """The street of drive `index` (from 0). Paces go round, from a place drawn from the seed."""
+def drive_street(seed: int, index: int, frames: int, period_s: float) -> Street:
+    """The street of drive `index` (from 0), a scan every `period_s`. Paces go round from a drawn place."""
     first = int(generator(seed, "pace").integers(5))
-    return build_street(generator(seed, "street", index), (frames - 1) * _PERIOD_S, first + index)
+    return build_street(generator(seed, "street", index), (frames - 1) * period_s, first + index)
 
 
-def ego_truth(street: Street, frames: int, rng: np.random.Generator) -> EgoTruth:
+def ego_truth(street: Street, frames: int, period_s: float, rng: np.random.Generator) -> EgoTruth:
     """Times and scanner poses of a drive; a scan starts when the one before ends, as KITTI's do."""
-    period = _PERIOD_S + rng.uniform(-1.5e-4, 1.5e-4, frames + 2)
+    period = period_s + rng.uniform(-1.5e-4, 1.5e-4, frames + 2)
     edge = np.concatenate([[0.0], np.cumsum(period)])
     middle = 0.5 * (edge[1:] + edge[:-1])
     middle -= middle[1]
@@ -307,10 +321,10 @@ def _still_returns(
     chance = (1.0 - table[:, 3]) * expit(2.5 * (echo + 6.0))
     chance = np.where(_shadow_fringe(profile)[rays.ray_ring, rays.ray_tick], _FRINGE_RETURN * chance, chance)
     luck = ndtr(0.8 * _along_ring(grid, 0.8, rng) + 0.6 * rng.standard_normal(len(rays)))
-    rough = sm.hypot(0.008, table[:, 2] / np.maximum(cosine, 0.15))
+    rough = sm.hypot(round(noise_model(profile).shot_std_m, 3), table[:, 2] / np.maximum(cosine, 0.15))
     noise = np.minimum(rough, 0.15) * rng.standard_normal(len(rays))
     measured = quantise_range(reach + profile.range_bias_m[rays.ray_ring] + noise, rays.ray_ring, profile)
-    steps = np.clip(np.rint(value / profile.reflectance_quantum), 0, 99)
+    steps = np.clip(np.rint(value / profile.reflectance_quantum), 0, profile.reflectance_steps)
     weak = 0.05 + 0.95 * expit(-1.5 * (echo + 3.6))  # exact zeros mean an echo below the scale
     steps = np.where(ndtr(_along_ring(grid, 0.9, rng)) < weak, 0.0, steps)
     return hit & (luck < chance), measured, steps * profile.reflectance_quantum
@@ -318,7 +332,8 @@ def _still_returns(
 
 def _shadow_fringe(profile: ScannerProfile) -> Bool:
     """(beams, lattice) the border of the ego car's shadow: the car's own edges take many of these pulses too."""
-    near = maximum_filter1d(profile.blind.astype(np.uint8), 2 * _FRINGE_TICKS + 1, axis=1, mode="wrap") > 0
+    width = 2 * round(_FRINGE * profile.lattice_size) + 1
+    near = maximum_filter1d(profile.blind.astype(np.uint8), width, axis=1, mode="wrap") > 0
     return np.asarray(near & ~profile.blind)
 
 
@@ -357,8 +372,8 @@ def _along_ring(grid: tuple[int, int], correlation: float, rng: np.random.Genera
 
 def _write_drive(day: Path, index: int, frames: int, seed: int, profile: ScannerProfile) -> str:
     name = f"{DATE}_drive_{index + 1:04d}_sync"
-    street = drive_street(seed, index, frames)
-    ego = ego_truth(street, frames, generator(seed, "clock", index))
+    street = drive_street(seed, index, frames, profile.period_s)
+    ego = ego_truth(street, frames, profile.period_s, generator(seed, "clock", index))
     caster = MeshCaster(street.still.vertices, street.still.faces)
     folder = day / name
     for part in ("velodyne_points/data", "oxts/data", "truth"):

@@ -478,8 +478,8 @@ def returns_have_their_own_ray(pair: AugmentedPair, rules: Rules, source: Source
         simulated = scan.source < 0
         known = (scan.ring < p.beams) & (scan.tick < p.lattice_size)
         yield from report.rows(f"tick{k}", simulated & ~known, scan.tick, "of a return is not known")
-        fired = np.zeros(p.lattice_size, dtype=bool)
-        fired[scan.tick[known & ~simulated]] = True
+        rows = None if source is None else (source.rows0, source.rows1)[k]
+        fired = _fired_ticks(pair, rules, scan, known, rows)
         key = np.where(known, scan.ring.astype(np.int64) * p.lattice_size + scan.tick, -1)
         new = np.flatnonzero(simulated & known)
         off = np.zeros(len(scan), dtype=bool)
@@ -504,6 +504,25 @@ def returns_have_their_own_ray(pair: AugmentedPair, rules: Rules, source: Source
         allowed = np.zeros(len(scan))
         allowed[on] = _ON_RAY_M + _ON_RAY_SHARE * np.abs(along)
         yield from report.rows(f"xyz{k}", ~(distance <= allowed), scan.xyz, "is off its ray", distance, "m")
+
+
+def _fired_ticks(pair: AugmentedPair, rules: Rules, scan: AugmentedScan, known: Array, rows: Array | None) -> Array:
+    """Which ticks (lattice,) were fired: a measured point is on them, or was until a car hid it.
+
+    A car that stands near hides every return of a tick, the sooner the fewer beams there are. Without the source's
+    `rows`, two simulated returns or more on one tick speak for it where rows were removed at all.
+    """
+    size = rules.profile.lattice_size
+    fired = np.bincount(scan.tick[known & (scan.source >= 0)], minlength=size) > 0
+    new = np.bincount(scan.tick[known & (scan.source < 0)], minlength=size)
+    if rows is None:
+        return np.asarray(fired | ((new >= 2) & (len(scan.removed) > 0)))
+    if (fired | (new == 0)).all():
+        return np.asarray(fired)
+    removed = scan.removed[(scan.removed >= 0) & (scan.removed < len(rows))]
+    _, tick = _rays_of_removed(pair, rules, scan, removed, rows[removed, :3].astype(np.float64))
+    fired[tick[tick >= 0]] = True
+    return np.asarray(fired)
 
 
 def cars_hide_what_is_behind(pair: AugmentedPair, rules: Rules, source: Source | None) -> Iterator[Offence]:

@@ -7,7 +7,7 @@ compared with each other. Shards are looked at in parallel.
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -85,13 +85,19 @@ class Report:
         }
 
 
-def validate_folder(folder: Path | str, kitti_root: Path | str | None = None, jobs: int = 1) -> Report:
+def validate_folder(
+    folder: Path | str,
+    kitti_root: Path | str | None = None,
+    jobs: int = 1,
+    on_pairs: Callable[[int], None] | None = None,
+) -> Report:
     """Check every invariant on every pair of a finished data set, and the folder itself.
 
     Args:
         folder: made by `augkitti generate`.
         kitti_root: where the source scans lie; None: what needs them is left out, and the report says so.
         jobs: number of processes.
+        on_pairs: told how many more pairs are checked, a shard at a time.
 
     Raises:
         InputError: the folder has no readable index, or the root holds no KITTI scans.
@@ -103,8 +109,14 @@ def validate_folder(folder: Path | str, kitti_root: Path | str | None = None, jo
     root = None if kitti_root is None else as_path(kitti_root)
     if root is not None:
         open_root(root)  # a wrong root is answered before any work
-    run = Parallel(n_jobs=max(1, min(jobs, len(index.shards))), batch_size=1)
-    findings = run(delayed(validate_shard)(folder, shard, root) for shard in index.shards)
+    run = Parallel(n_jobs=max(1, min(jobs, len(index.shards))), batch_size=1, return_as="generator")
+    findings = []
+    for shard, finding in zip(
+        index.shards, run(delayed(validate_shard)(folder, shard, root) for shard in index.shards), strict=True
+    ):
+        findings.append(finding)
+        if on_pairs is not None:
+            on_pairs(shard.rows)
     return make_report(folder, index, findings, root is not None)
 
 

@@ -41,7 +41,7 @@ def on_streets(root, seed, frames, config, profile, verbose):
     bodies_hit = bodies = 0
     times = []
     for index, sequence in enumerate(open_root(root).sequences):
-        street = drive_street(seed, index, frames)
+        street = drive_street(seed, index, frames, profile.period_s)
         for frame0, _ in sequence.pairs:
             pair = read_pair(sequence, frame0)
             scan0, scan1 = prepare(pair.scan0, profile, config), prepare(pair.scan1, profile, config)
@@ -52,7 +52,7 @@ def on_streets(root, seed, frames, config, profile, verbose):
             owner = truth["object"][pair.scan0.row]
             moving = truth["moving"][pair.scan0.row]
             near = np.hypot(pair.scan0.xyz[:, 0], pair.scan0.xyz[:, 1]) <= REACH_M
-            world = np.array([0.0, pair.scan1.time_s - pair.scan0.time_s]) + frame0 * 0.1034
+            world = np.array([0.0, pair.scan1.time_s - pair.scan0.time_s]) + frame0 * profile.period_s
             for number in np.unique(owner[owner >= 0]):
                 mine = owner == number
                 poses = body_poses(street.bodies[number], world)

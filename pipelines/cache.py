@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from augkitti.command_line import is_json, print_json
 from augkitti.dataset_index import replace_whole
 from augkitti.errors import InputError, MachineError
 
@@ -232,6 +233,11 @@ def show_cache() -> None:
     """Print where the cache is, what it keeps, and how large it may become."""
     folder, bound = cache_folder(), bound_bytes()
     there = entries(folder)
+    if is_json():
+        kinds = {kind: [entry.bytes for entry in there if entry.kind == kind] for kind in _PATTERNS}
+        content = {kind: {"entries": len(sizes), "bytes": sum(sizes)} for kind, sizes in kinds.items()}
+        print_json({"folder": str(folder), "most_bytes": bound, "kinds": content})
+        return
     print(f"{folder}: {sum(entry.bytes for entry in there) / 1e9:,.2f} of at most {bound / 1e9:,.1f} GB")
     for kind in _PATTERNS:
         sizes = [entry.bytes for entry in there if entry.kind == kind]

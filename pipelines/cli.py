@@ -18,10 +18,16 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from augkitti import command_line
 from augkitti.errors import InputError, MachineError
 from augkitti.remote import as_path
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+class _Group(command_line.Group):
+    json_may_name_a_file = ("validate", "fit-sensor", "judge-noise")
+
+
+app = typer.Typer(cls=_Group, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 config_app = typer.Typer(no_args_is_help=True, help="Every setting of generation.")
 cad_app = typer.Typer(no_args_is_help=True, help="Car models.")
 data_app = typer.Typer(no_args_is_help=True, help="KITTI on disk.")
@@ -73,10 +79,18 @@ Glass = Annotated[Literal["pass", "opaque"] | None, typer.Option(help="Whether p
 Shutter = Annotated[
     Literal["rolling", "snapshot"] | None, typer.Option(help="Each ray at its own firing time, or all at once.")
 ]
-Profile = Annotated[Path | None, typer.Option(help="Scanner profile (JSON, or its folder). Without: KITTI's HDL-64E.")]
+Profile = Annotated[
+    Path | None,
+    typer.Option(help="Scanner profile: hdl32e, or a file (JSON, YAML) or folder. Without: KITTI's HDL-64E."),
+]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="Settings (YAML); see `augkitti config show`.")]
 OnError = Annotated[Literal["skip", "stop"], typer.Option(help="Leave out pairs whose source is unreadable, or stop.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+JsonFile = Annotated[
+    str | None,
+    typer.Option("--json", metavar="[FILE]", help="Print JSON instead of tables; with a file: write it there, too."),
+]
 
 
 def _print_version(wanted: bool) -> None:
@@ -92,25 +106,33 @@ def _augkitti(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Nothing but errors and what was asked for.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Versions, settings, times; the traceback behind an error.")
+    ] = False,
 ) -> None:
     """Augmented KITTI: virtual cars with exact motion labels in real LiDAR scans."""
+    command_line.begin(quiet, verbose)
 
 
 _GO_ON = "; finished shards are kept, go on with --resume"
 
 
 @contextmanager
-def _answers(at_end: str = "") -> Iterator[None]:
+def _answers(at_end: str = "", json: bool = False) -> Iterator[None]:
     """Bad input: one line on stderr, exit code 2. The machine gave way: 3. Interrupted: 130. Told to end: 143."""
+    command_line.json_alone(json)
     for library in ("OMP", "OPENBLAS", "MKL", "VECLIB_MAXIMUM", "NUMEXPR"):  # read when numpy is imported, below
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # processes share the work, not threads
     before = _on_sigterm(_terminated)
     try:
         yield
     except InputError as err:
+        command_line.trace()
         print(f"augkitti: {err}", file=sys.stderr)
         raise typer.Exit(2) from None
     except MachineError as err:
+        command_line.trace()
         print(f"augkitti: {err}", file=sys.stderr)
         raise typer.Exit(3) from None
     except _Terminated:
@@ -165,9 +187,10 @@ def generate(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the plan with disk and time; touch nothing.")
     ] = False,
+    json: Json = False,
 ) -> None:
     """Real scan pairs in, the same with virtual cars and exact motion labels out, as Parquet shards."""
-    with _answers(_GO_ON):
+    with _answers(_GO_ON, json):
         from pipelines.generate import generate as run
         from pipelines.run import read_options
 
@@ -220,9 +243,9 @@ def augment(out: Folder = DEFAULT_OUT, jobs: Jobs = 1, scheduler: Scheduler = No
 
 
 @app.command()
-def finish(out: Folder = DEFAULT_OUT) -> None:
+def finish(out: Folder = DEFAULT_OUT, json: Json = False) -> None:
     """Stage 3 of generate. Reads the plan and the shards' rows; writes dataset.json and README.md."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.generate import finish_stage
 
         raise typer.Exit(finish_stage(out))
@@ -243,9 +266,10 @@ def split(
     allow_frames_split: Annotated[
         bool, typer.Option("--allow-frames-split", help="May divide one recording, with a gap: toy sets only.")
     ] = False,
+    json: Json = False,
 ) -> None:
     """Divide the data set by recording; writes splits.json and the card's header."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.inspect_set import split_set
 
         named = [name for text in test_on or [] for name in text.split(",") if name]
@@ -259,13 +283,13 @@ def validate(
     out: Folder = DEFAULT_OUT,
     kitti: Kitti = None,
     jobs: Jobs = 1,
-    json: Annotated[Path | None, typer.Option(help="Write the findings there.")] = None,
+    json: JsonFile = None,
 ) -> None:
     """Check every invariant of the contract on every pair."""
-    with _answers():
+    with _answers(json=json == "-"):
         from pipelines.inspect_set import validate_set
 
-        raise typer.Exit(validate_set(out, kitti, jobs, json))
+        raise typer.Exit(validate_set(out, kitti, jobs, _json_file(json)))
 
 
 @app.command()
@@ -306,15 +330,15 @@ def view(
 @app.command()
 def info(
     folder: Folder = DEFAULT_OUT,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    json: Json = False,
     out: Annotated[Path | None, typer.Option(help="Picture to write (PNG).")] = None,
     kitti: Kitti = None,
 ) -> None:
     """Totals, car points, speeds and yaw rates, beside the labelled motions of real KITTI."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.inspect_set import show_info
 
-        show_info(folder, json, out, kitti)
+        show_info(folder, out, kitti)
 
 
 @app.command()
@@ -365,9 +389,10 @@ def realism(
     max_tracks: Annotated[int | None, typer.Option(min=1, help="Stop after so many labelled cars.")] = None,
     views: Annotated[int, typer.Option(min=1, help="Most views of one car.")] = 12,
     profile: Profile = None,
+    json: Json = False,
 ) -> None:
     """Prove how real simulated cars are: one HTML report beside real labelled cars, with a verdict at the top."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.realism import realism as run
 
         code = run(
@@ -388,13 +413,13 @@ def realism(
 def fit_sensor(
     kitti: Kitti = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Profile's folder, written.")] = Path("profile"),
-    json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
+    json: JsonFile = None,
 ) -> None:
     """Learn a scanner's beam table, encoder, spin, steps and shadow from raw scans alone."""
-    with _answers():
+    with _answers(json=json == "-"):
         from pipelines.fit_sensor import fit_sensor as run
 
-        run(_needed(kitti), out, json)
+        run(_needed(kitti), out, _json_file(json))
 
 
 @app.command("fit-noise")
@@ -426,19 +451,19 @@ def judge_noise(
         Path | None,
         typer.Option(metavar="DIR", help="Folder that `augkitti fit-noise` wrote. Without: the shipped."),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
+    json: JsonFile = None,
 ) -> None:
     """Print how well a noise profile foretells any raw scans: a constant, both models, the shipped one."""
-    with _answers():
+    with _answers(json=json == "-"):
         from pipelines.judge_noise import judge_noise as run
 
-        run(_needed(kitti), profile, json)
+        run(_needed(kitti), profile, _json_file(json))
 
 
 @config_app.command("show")
-def config_show(config: ConfigFile = None) -> None:
+def config_show(config: ConfigFile = None, json: Json = False) -> None:
     """Print each key with its value and one line of why; valid YAML."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.inspect_set import show_config
 
         show_config(config)
@@ -448,27 +473,28 @@ def config_show(config: ConfigFile = None) -> None:
 def cad_check(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of car models.")],
     sheet: Annotated[Path | None, typer.Option(help="Contact sheet to write (PNG).")] = None,
+    json: Json = False,
 ) -> None:
     """Print what each model of a folder is taken for, and why."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.inspect_set import check_cad
 
         raise typer.Exit(check_cad(folder, sheet))
 
 
 @data_app.command("status")
-def data_status(kitti: Kitti = None) -> None:
+def data_status(kitti: Kitti = None, json: Json = False) -> None:
     """Compare a disk with the manifest of KITTI: what is there, missing, cut short, what to fetch."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.inspect_set import show_data_status
 
         raise typer.Exit(show_data_status(kitti))
 
 
 @cache_app.command("info")
-def cache_info() -> None:
+def cache_info(json: Json = False) -> None:
     """Print where the cache is, what it keeps, and how large it may become ($AUGKITTI_CACHE_GB)."""
-    with _answers():
+    with _answers(json=json):
         from pipelines.cache import show_cache
 
         show_cache()
@@ -481,7 +507,14 @@ def cache_clear() -> None:
         from pipelines.cache import cache_folder, clear
 
         count, size = clear(cache_folder())
-        print(f"{count:,} entries removed, {size / 1e9:,.2f} GB")
+        command_line.note(f"{count:,} entries removed, {size / 1e9:,.2f} GB")
+
+
+def _json_file(text: str | None) -> Path | None:
+    """The file that `--json` names; None where it prints, or was not given."""
+    if text is not None and Path(text).is_dir():
+        raise InputError(f"--json {text}", "is a folder", "give --json last, or a file to write")
+    return None if text in (None, "-") else Path(str(text))
 
 
 def _needed(kitti: Path | None) -> Path:
@@ -506,4 +539,4 @@ def _categories(names: list[str] | None) -> tuple[str, ...] | None:
 
 def main() -> None:
     """Entry point of the command."""
-    app()
+    app(prog_name="augkitti")

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from augkitti import kitti, noise_patches, range_noise
+from augkitti.command_line import counted, note
 from augkitti.errors import InputError
 from augkitti.frames import F64
 from augkitti.kitti import KittiRoot
@@ -65,7 +66,7 @@ def fit_noise(
     vehicles: bool = True,
     steps: int = 1500,
     seed: int = 0,
-    say: Say = print,
+    say: Say = note,
 ) -> NoiseProfile:
     """Learn a scanner's noise from a root's raw scans and write it to a profile's folder.
 
@@ -181,7 +182,7 @@ def _car_models(folder: Path | None) -> Sequence[CarModel]:
     return [model for model in models if model.category in ("Car", "Van")]
 
 
-def compare_models(judged: Judged, scanner: ScannerProfile, steps: int, say: Say = print) -> dict[str, dict[str, Any]]:
+def compare_models(judged: Judged, scanner: ScannerProfile, steps: int, say: Say = note) -> dict[str, dict[str, Any]]:
     """Figures on each recording (or group of them) of profiles fitted on the others, biases included.
 
     Object scans are fitted on but are no fold: each is of another drive.
@@ -189,7 +190,7 @@ def compare_models(judged: Judged, scanner: ScannerProfile, steps: int, say: Say
     names = sorted({name for (name, drive, _) in judged.scans if name != drive}) or sorted(set(judged.recording))
     groups = [names[i::MOST_FOLDS] for i in range(min(MOST_FOLDS, len(names)))]
     folds = {}
-    for group in groups:
+    for group in counted(groups, len(groups), "folds"):
         held = np.isin(judged.recording, group)
         rest, unseen = judged.of(np.flatnonzero(~held)), judged.of(np.flatnonzero(held))
         if not len(unseen.returns.ring) or len(rest.returns.ring) < MIN_RETURNS // 2:
@@ -535,7 +536,7 @@ def _fit_misses(at: RayConditions, missed: npt.NDArray[np.bool_], beams: int, st
     beam = torch.zeros(beams, requires_grad=True)
     optimiser = torch.optim.Adam([*first.parameters(), *second.parameters(), beam], lr=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, max_lr=0.02, total_steps=steps)
-    for _ in range(steps):
+    for _ in counted(range(steps), steps, "steps"):
         rows = torch.from_numpy(rng.integers(0, len(y), min(32768, len(y))))
         optimiser.zero_grad()
         z = second(torch.nn.functional.softsign(first(x[rows])))[:, 0] + beam[rings[rows]]

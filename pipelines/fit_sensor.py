@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
+import augkitti
 from augkitti import kitti
+from augkitti.command_line import as_json, counted, is_json, note, print_json
 from augkitti.errors import InputError
 from augkitti.fit_sensor import (
     MIN_SCANS,
@@ -48,7 +50,7 @@ class HeldOut:
     assigned: float
 
 
-def fit_sensor(root: Path, out: Path, json_file: Path | None = None, say: Say = print) -> dict[str, Any]:
+def fit_sensor(root: Path, out: Path, json_file: Path | None = None, say: Say = note) -> dict[str, Any]:
     """Fit a scanner's profile on a root's raw scans and write its folder; the figures, as in `json_file`.
 
     Args:
@@ -73,19 +75,23 @@ def fit_sensor(root: Path, out: Path, json_file: Path | None = None, say: Say = 
     held_out = judge_held_out([p for p in places if (p[0].recording, p[1]) not in unread])
     content["fit"]["held_out"] = [vars(part) for part in held_out]
     figures: dict[str, Any] = {
+        "program_version": augkitti.__version__,
         "beams": table.beams,
         **{key: value for key, value in content.items() if not isinstance(value, list | dict)},
         "blind_share": round(_blind_share(content), 5),
         **content["fit"],
     }
-    for line in summary(figures):
-        say(line)
+    if is_json():
+        print_json(figures)
+    else:
+        for line in summary(figures):
+            say(line)
     texts = {
         out / PROFILE_FILE: json.dumps(content, indent=1) + "\n",
         out / "README.md": card(content, figures),
     }
     if json_file is not None:
-        texts[json_file] = json.dumps(figures, indent=1) + "\n"
+        texts[json_file] = as_json(figures)
     for path, text in texts.items():
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -135,7 +141,7 @@ def raw_places(root: KittiRoot) -> list[Place]:
     )
 
 
-def fit(places: Sequence[Place], say: Say = print) -> tuple[BeamTable, Evidence, dict[tuple[str, int], str]]:
+def fit(places: Sequence[Place], say: Say = note) -> tuple[BeamTable, Evidence, dict[tuple[str, int], str]]:
     """Beam table and evidence of scans, and by drive and frame why some of them were left out.
 
     Scans that turn out to lie off the rays are left out and the table is fitted again.
@@ -147,7 +153,7 @@ def fit(places: Sequence[Place], say: Say = print) -> tuple[BeamTable, Evidence,
     chosen = evenly(places, MOST_SCANS)
     while True:
         usable = [p for p in chosen if (p[0].recording, p[1]) not in unread]
-        table_scans = [s for p in _spread(usable, MOST_TABLE_SCANS) if (s := read(p, unread)) is not None]
+        table_scans = list(_read_all(_spread(usable, MOST_TABLE_SCANS), unread))
         if not table_scans and unread:
             first = next(iter(unread))
             raise InputError(f"{first[0]}, frame {first[1]}", unread[first], "no scan can be used: fetch them again")
@@ -220,7 +226,7 @@ def read(place: Place, unread: dict[tuple[str, int], str]) -> SourceScan | None:
 
 
 def _read_all(places: Sequence[Place], unread: dict[tuple[str, int], str]) -> Iterator[SourceScan]:
-    for place in places:
+    for place in counted(places, len(places), "scans"):
         source = read(place, unread)
         if source is not None:
             yield source

@@ -167,7 +167,7 @@ def fit_noise(
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """A whole `noise` part: `base` with its vehicle keys learned from views."""
-    counted, scores = fit_strength(views)
+    counted, scores = fit_strength(views, profile.ring_step_rad)
     noise = _merged(base, counted)
     real = figures_of(views, [_real_returns(v) for v in views])
     drawn = real.body if body_rates is None else np.array(body_rates)
@@ -192,9 +192,9 @@ class _Cells:
     counts: F64  # (C, 3) nothing, zeros, more; weighted
 
 
-def fit_strength(views: Sequence[FittedView]) -> tuple[dict[str, Any], F64]:
-    """Strengths of echoes as noise keys, and the paint score (T,) of each track."""
-    cells = _cells(views)
+def fit_strength(views: Sequence[FittedView], ring_step_rad: float) -> tuple[dict[str, Any], F64]:
+    """Strengths of echoes as noise keys, and the paint score (T,) of each track; beams lie `ring_step_rad` apart."""
+    cells = _cells(views, ring_step_rad)
     tracks = int(cells.track.max()) + 1
     names = list(_KINDS)
     at = {name: i for i, name in enumerate(names)}
@@ -243,12 +243,12 @@ def fit_strength(views: Sequence[FittedView]) -> tuple[dict[str, Any], F64]:
     return noise, score
 
 
-def _cells(views: Sequence[FittedView]) -> _Cells:
+def _cells(views: Sequence[FittedView], ring_step_rad: float) -> _Cells:
     keys, weights, outcomes = [], [], []
     rays_of = np.bincount([v.track for v in views], weights=[v.cast.row.sum() for v in views])
     for v in views:
         row, hits = v.cast.row, v.cast.hits
-        kind, expected = _kinds_of(v), hits.range_m[:, 0]
+        kind, expected = _kinds_of(v, ring_step_rad), hits.range_m[:, 0]
         measured, own, real = v.view.measured_m[row], v.own[row], v.real
         on = own & (np.abs(np.where(own, measured, 0.0) - expected) < _ON_SURFACE_M)
         window = np.isin(kind, (GLASS, _FRAME))
@@ -268,13 +268,13 @@ def _cells(views: Sequence[FittedView]) -> _Cells:
     return _Cells(key[:, 0].astype(np.int32), key[:, 1].astype(np.int32), key[:, 2] / 10.0, middle[key[:, 3]], counts)
 
 
-def _kinds_of(v: FittedView) -> I32:
+def _kinds_of(v: FittedView, ring_step_rad: float) -> I32:
     """Kind of the first surface of each ray that meets the model; paint near panes is a kind of its own."""
     rays, hits = v.view.scan.rays, v.cast.hits
     kind = hits.surface[:, 0].astype(np.int32)
     pane = kind == GLASS
     if pane.any():
-        grid = FieldGrid(rays.ray_ring[hits.ray], rays.ray_azimuth_rad[hits.ray])
+        grid = FieldGrid(rays.ray_ring[hits.ray], rays.ray_azimuth_rad[hits.ray], ring_step_rad)
         near = grid.near(pane, _FRAME_M / float(np.median(hits.range_m[:, 0])))
         kind[(kind == PAINT) & near] = _FRAME
     return kind

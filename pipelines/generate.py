@@ -9,10 +9,12 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
-from augkitti.dataset_index import INDEX_NAME
+from augkitti.command_line import aside, detail, is_json, is_quiet, note, print_json
+from augkitti.dataset_index import INDEX_NAME, ShardEntry
 from augkitti.errors import InputError
 from pipelines.augment import augment_all
 from pipelines.finish import finish_set
@@ -61,17 +63,22 @@ def generate(options: Options, jobs: int, resume: bool, dry_run: bool, scheduler
     if dry_run:
         return show_plan(options, jobs)
     started = time.monotonic()
+    detail(f"cache {options.cache}; configuration {options.config.digest()[:12]}; scanner {options.scanner.name}")
     if scheduler is not None:
         check_scheduler(scheduler)
     run = _begin(options, jobs, resume)
     if resume and (made := _already_made(run)) is not None:
+        if is_json():
+            print_json({"folder": str(options.out), "asked": options.n, "pairs": made, "already_made": True})
         return _shortfall(made, options.n, f"`skipped` in {INDEX_NAME} says why")
     with hold(options.work):
         if scheduler is None:
             _prepare(run, jobs, resume)
         else:
             start_work(run, resume)
+        detail("prepared; making shards")
         rows = augment_all(run, jobs, scheduler)
+        detail("shards made; writing the index")
         return _close(run, rows, time.monotonic() - started)
 
 
@@ -93,7 +100,7 @@ def _already_made(run: Run) -> int | None:
     index = finished_index(run)
     if index is None:
         return None
-    print(f"{run.options.out} is finished and whole: nothing to do")
+    note(f"{run.options.out} is finished and whole: nothing to do")
     return index.rows
 
 
@@ -103,10 +110,10 @@ def _begin(options: Options, jobs: int, resume: bool) -> Run:
     check_output(options.out, resume)
     if options.streets is None:
         run = open_run(options)
-        print(_first_line(options), flush=True)
+        note(_first_line(options))
         _print_notes(run)
         return run
-    print(_first_line(options), flush=True)
+    note(_first_line(options))
     make_streets(options.streets, options.scanner, jobs)
     run = open_run(options)
     _print_notes(run)
@@ -120,10 +127,10 @@ def _print_notes(run: Run) -> None:
         library = load_library(options.cad, options.config.categories, options.cache)
         left_out = len(library.report) - len(library.models)
         wanted = ", ".join(options.config.categories)
-        print(f"car models: {len(library.models)} used ({wanted}), {left_out} not (`augkitti cad check` says why)")
+        note(f"car models: {len(library.models)} used ({wanted}), {left_out} not (`augkitti cad check` says why)")
     there = sum(len(sequence.pairs) for sequence in run.sequences.values())
     if options.config.cars[1] == 0 and options.n > there:
-        print(f"note: plain pairs do not vary, and there are {there} scan pairs: some are written more than once")
+        note(f"note: plain pairs do not vary, and there are {there} scan pairs: some are written more than once")
 
 
 def _prepare(run: Run, jobs: int, resume: bool) -> None:
@@ -138,7 +145,7 @@ def _prepare(run: Run, jobs: int, resume: bool) -> None:
         jobs,
         options.stop_on_error,
     )
-    print(f"prepared: {made} made, {kept} found in {options.cache}", file=sys.stderr)
+    aside(f"prepared: {made} made, {kept} found in {options.cache}")
 
 
 def augment_stage(out: Path, jobs: int, scheduler: str | None = None) -> None:
@@ -210,6 +217,10 @@ def _print_totals(run: Run, rows: list[ShardRow], made: int, seconds: float | No
         for entry in row.skipped:
             skipped[entry["source"], entry["reason"]] += entry["count"]
     entries = [row.entry for row in rows if row.entry is not None]
+    if is_json():
+        print_json(_totals_json(run, totals, skipped, entries, made, seconds))
+    if is_json() or is_quiet():
+        return
     table = Table(title=str(run.options.out), show_header=False, title_justify="left")
     table.add_row("pairs", f"{made:,} of {run.options.n:,}")
     table.add_row("shards", f"{len(entries):,}, {sum(entry.bytes for entry in entries) / 1e6:,.1f} MB")
@@ -227,38 +238,65 @@ def _print_totals(run: Run, rows: list[ShardRow], made: int, seconds: float | No
     console().print(table)
 
 
+def _totals_json(
+    run: Run,
+    totals: Counter[str],
+    skipped: Counter[tuple[str, str]],
+    entries: list[ShardEntry],
+    made: int,
+    seconds: float | None,
+) -> dict[str, Any]:
+    """The end report as JSON; the index has all of it but the time."""
+    return {
+        "folder": str(run.options.out),
+        "asked": run.options.n,
+        "pairs": made,
+        "shards": len(entries),
+        "bytes": sum(entry.bytes for entry in entries),
+        "totals": dict(sorted(totals.items())),
+        "skipped": [{"source": s, "reason": r, "count": count} for (s, r), count in skipped.most_common()],
+        "seconds": None if seconds is None else round(seconds, 3),
+    }
+
+
 def show_plan(options: Options, jobs: int) -> int:
     """Print what a run would make, with disk and time; touches nothing."""
     assert options.models is not None
     check_output(options.out, resume=True)
-    print(_first_line(options))
+    note(_first_line(options))
     streets = options.streets
     if streets is not None and not streets.are_there:
         scans = streets.drives * streets.frames
-        _print_estimate(options.n, scans, jobs, streets)
+        _print_estimate(options.n, scans, jobs, streets, {})
         return 0
     run = open_run(options)
     table = Table("sequence", "scan pairs", "pairs to make", "shards", title="plan", title_justify="left")
     of_sequence: dict[str, list[ShardPlan]] = {}
+    quotas: dict[str, int] = {}
     for shard in run.shards:
         of_sequence.setdefault(shard.sequence, []).append(shard)
     for name, shards in of_sequence.items():
-        quota = sum(shard.quota for shard in shards)
+        quota = quotas[name] = sum(shard.quota for shard in shards)
         table.add_row(name, f"{len(run.sequences[name].pairs):,}", f"{quota:,}", f"{len(shards):,}")
-    console().print(table)
+    if not is_json():
+        console().print(table)
     for entry in run.left_out:
-        print(f"left out: {entry['source']}: {entry['reason']} ({entry['count']} pairs)")
+        note(f"left out: {entry['source']}: {entry['reason']} ({entry['count']} pairs)")
     scans = sum(len({*frames, *(f + 1 for f in frames)}) for frames in run.planned_frames().values())
-    _print_estimate(options.n, scans, jobs, None)
+    _print_estimate(options.n, scans, jobs, None, quotas)
     return 0
 
 
-def _print_estimate(n: int, scans: int, jobs: int, streets: Streets | None) -> None:
+def _print_estimate(n: int, scans: int, jobs: int, streets: Streets | None, quotas: dict[str, int]) -> None:
     seconds = n * SECONDS_PER_PAIR + scans * SECONDS_PER_PREPARED_SCAN
     cache = scans * BYTES_PER_PREPARED_SCAN
     if streets is not None:
         seconds += scans * SECONDS_PER_STREET_SCAN
         cache += scans * BYTES_PER_STREET_SCAN
+    if is_json():
+        about = {"bytes": n * BYTES_PER_PAIR, "cache_bytes": cache, "seconds": seconds / jobs}
+        print_json({"pairs": n, "scans": scans, "sequences": quotas, "about": about})
+        return
     print(
         f"{n:,} pairs of {scans:,} scans: about {n * BYTES_PER_PAIR / 1e9:,.2f} GB on disk, {cache / 1e9:,.2f} GB in "
         f"the cache, {_duration(seconds / jobs)} with --jobs {jobs} (spares not counted; nothing was written)"

@@ -3,15 +3,16 @@
 import datetime
 import json
 import os
-import sys
 import types
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from rich.table import Table
 
+from augkitti.command_line import as_json, aside, is_json, is_quiet, note, print_json, progress
 from augkitti.config import load_config
 from augkitti.dataset_index import DatasetIndex
 from augkitti.dataset_info import Motions
@@ -30,6 +31,9 @@ def show_config(path: Path | None) -> None:
         InputError: the file is bad.
     """
     config = load_config(path)
+    if is_json():
+        print_json({"configuration": config.model_dump(mode="json"), "configuration_digest": config.digest()})
+        return
     print("# The defaults." if path is None else f"# {path}, with defaults where it says nothing.")
     for line in _config_lines(config, 0):
         print(line)
@@ -70,22 +74,26 @@ def check_cad(folder: Path, sheet: Path | None) -> int:
     from augkitti.cad_models import load_cad_folder
 
     library = load_cad_folder(folder, cache_dir=cache_folder() / "cad")
+    out = [row for row in library.report if row.problem]
     table = Table("name", "category", "size (m)", "triangles", "glass", "problem", title=str(folder))
     for row in library.report:
         size = " x ".join(f"{side:.2f}" for side in row.size_m) if row.size_m else ""
         glass = f"{100 * row.glass_share:.0f} %" if row.size_m else ""
         triangles = f"{row.triangles:,}" if row.triangles else ""
         table.add_row(row.name, row.category, size, triangles, glass, row.problem or "")
-    console().print(table)
-    for row in library.report:
-        print(f"{row.name}: {'; '.join(row.decisions) or 'left out'}")
-    out = [row for row in library.report if row.problem]
-    print(f"{len(library.models)} usable, {len(out)} left out")
+    if is_json():
+        models = [asdict(row) for row in library.report]
+        print_json({"folder": str(folder), "usable": len(library.models), "left_out": len(out), "models": models})
+    else:
+        console().print(table)
+        for row in library.report:
+            print(f"{row.name}: {'; '.join(row.decisions) or 'left out'}")
+        print(f"{len(library.models)} usable, {len(out)} left out")
     if sheet is not None:
         from augkitti.cad_sheet import draw_contact_sheet
 
         draw_contact_sheet(library, sheet)
-        print(sheet)
+        note(str(sheet))
     return 1 if out else 0
 
 
@@ -103,6 +111,10 @@ def show_data_status(kitti: Path | None) -> int:
     if kitti is None:
         raise InputError("--kitti", "is missing", "name the folder with KITTI in it, or set AUGKITTI_KITTI")
     rows = data_status(kitti)
+    code = 1 if any(row.state == "damaged" for row in rows) else 0
+    if is_json():
+        print_json({"root": str(kitti), "drives": [asdict(row) for row in rows]})
+        return code
     table = Table("drive", "category", "state", "scans", "pairs", "remarks", title=str(kitti), title_justify="left")
     for row in rows:
         scans = f"{row.scans:,}" + (f" of {row.expected:,}" if row.expected else "")
@@ -116,7 +128,7 @@ def show_data_status(kitti: Path | None) -> int:
         print("to download:")
         for address in addresses:
             print(f"  {address}")
-    return 1 if any(row.state == "damaged" for row in rows) else 0
+    return code
 
 
 def split_set(
@@ -141,13 +153,18 @@ def split_set(
         raise InputError(out, f"cannot be written ({err.strerror})", "check its permissions") from err
     index = read_index(out)
     counts = pairs_by_split(index, splits)
+    if is_json():
+        found = {name: {"pairs": pairs, "recordings": recordings} for name, (pairs, recordings) in counts.items()}
+        print_json({"folder": str(out), "divides_recordings": splits.divides_recordings, "splits": found})
+        return
     total = max(1, sum(pairs for pairs, _ in counts.values()))
     table = Table("split", "pairs", "share", "recordings", title=str(out), title_justify="left")
     for name, (pairs, recordings) in counts.items():
         table.add_row(name, f"{pairs:,}", f"{100 * pairs / total:.1f} %", f"{recordings:,}")
-    console().print(table)
+    if not is_quiet():
+        console().print(table)
     if splits.divides_recordings:
-        print("a recording is divided between splits: for toy sets only")
+        note("a recording is divided between splits: for toy sets only")
 
 
 def describe_set(folder: Path, out: Path, url: str | None, published: datetime.date) -> None:
@@ -174,7 +191,7 @@ def describe_set(folder: Path, out: Path, url: str | None, published: datetime.d
         write_text(out, text)
     except OSError as err:
         raise InputError(out, f"cannot be written ({err.strerror})", "name another file") from err
-    print(out)
+    note(str(out))
 
 
 def view_pair(folder: Path, pair_id: str | None, picture: Path, kitti: Path | None) -> None:
@@ -201,12 +218,12 @@ def view_pair(folder: Path, pair_id: str | None, picture: Path, kitti: Path | No
         sequence = open_root(root).sequence(pair.sequence)
         prepared = [prepared_scan(sequence, f, profile, config, cache_folder())[0] for f in (pair.frame0, pair.frame1)]
     if prepared is None:
-        print("no source at hand: give --kitti to see what the cars hide", file=sys.stderr)
-        draw_pair(pair, picture)
+        aside("no source at hand: give --kitti to see what the cars hide")
+        draw_pair(pair, picture, profile=profile)
     else:
         scan0, scan1 = prepared
-        draw_pair(pair, picture, scan0.scan, scan1.scan, scan0.region, scan0.ground)
-    print(picture)
+        draw_pair(pair, picture, scan0.scan, scan1.scan, scan0.region, scan0.ground, profile=profile)
+    note(str(picture))
 
 
 def set_profile(folder: Path, index: DatasetIndex) -> ScannerProfile:
@@ -253,27 +270,29 @@ def synthesize_drives(out: Path, drives: int, frames: int, seed: int, jobs: int,
     from augkitti.scanner import load_profile
     from augkitti.synthesize import synthesize
 
-    for folder in synthesize(out, drives, frames, seed, load_profile(profile), jobs):
-        print(folder)
+    with progress(drives, "drives") as done:
+        folders = synthesize(out, drives, frames, seed, load_profile(profile), jobs, done)
+    for folder in folders:
+        note(str(folder))
 
 
-def show_info(folder: Path, as_json: bool, picture: Path | None, kitti: Path | None) -> None:
+def show_info(folder: Path, picture: Path | None, kitti: Path | None) -> None:
     """Figures of a data set, beside the labelled motions of real KITTI.
 
     Raises:
         InputError: no data set there, or a shard, a source or the picture is at fault.
     """
-    from augkitti.dataset_info import dataset_info, draw_info, info_json, info_tables
+    from augkitti.dataset_info import dataset_info, draw_info, info_tables
 
     info = dataset_info(folder, None if kitti is None else labelled_motions(kitti))
-    if as_json:
-        print(info_json(info))
+    if is_json():
+        print_json(info.as_dict())
     else:
         for table in info_tables(info):
             console().print(table)
     if picture is not None:
         draw_info(info, picture)
-        print(picture, file=sys.stderr if as_json else sys.stdout)
+        note(str(picture))
 
 
 def labelled_motions(kitti: Path, most: int = 500) -> Motions:
@@ -316,7 +335,16 @@ def validate_set(folder: Path, kitti: Path | None, jobs: int, report_file: Path 
 
     index = read_index(folder)
     root = source_of(index, set_profile(folder, index), kitti, make=True)
-    report = validate_folder(folder, root, jobs)
+    with progress(index.rows, "pairs") as done:
+        report = validate_folder(folder, root, jobs, done)
+    if report_file is not None:
+        try:
+            write_text(report_file, as_json(report.as_json()))
+        except OSError as err:
+            raise InputError(report_file, f"cannot be written ({err.strerror})", "name another file") from err
+    if is_json():
+        print_json(report.as_json())
+        return 0 if report.ok else 1
     table = Table("", "invariant", "pairs checked", "offences", "not checked", title=str(folder), title_justify="left")
     for number, title in TITLES.items():
         checked = f"{report.checked.get(number, 0):,}"
@@ -328,9 +356,4 @@ def validate_set(folder: Path, kitti: Path | None, jobs: int, report_file: Path 
     for offence in report.first:
         print(f"{offence.invariant} {offence.pair_id} {offence.column} {offence.value}: {offence.message}")
     print(f"{report.pairs:,} pairs of {report.shards:,} shards: {sum(report.counts.values()):,} offences")
-    if report_file is not None:
-        try:
-            write_text(report_file, json.dumps(report.as_json(), indent=1) + "\n")
-        except OSError as err:
-            raise InputError(report_file, f"cannot be written ({err.strerror})", "name another file") from err
     return 0 if report.ok else 1

@@ -4,7 +4,6 @@ Returns on smooth patches, bracketed rays and range steps (`augkitti.noise_patch
 are set against the three models of each kind (`augkitti.range_noise`). Clumps of misses need labelled vehicles.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import augkitti
 from augkitti import kitti, noise_patches, range_noise
+from augkitti.command_line import as_json, aside, counted, is_json, print_json
 from augkitti.config import Config
 from augkitti.errors import InputError
 from augkitti.frames import F64
@@ -127,8 +128,8 @@ def judge_scans(
     """Patches, bracketed rays and edges of scans, all chosen without what is judged."""
     rng = np.random.default_rng(seed)
     parts, tried = [], 0
-    for number, (drive, frame) in enumerate(scans):
-        scan = kitti.read_scan(drive, frame)
+    for number, (drive, frame) in enumerate(counted(scans, len(scans), "scans")):
+        scan = kitti.read_scan(drive, frame, scanner.elevation_rad)
         noise_patches.check_raw(scan, f"{drive.name}, frame {frame}")
         rays = assign_rays(scan, scanner)
         returns, count = noise_patches.judge_returns(
@@ -289,20 +290,24 @@ def judge_noise(root: Path, profile: Path | None = None, out: Path | None = None
     scans = most_scans(raw_scans(opened))
     scanner, noise = profile_of(profile)
     if (others := left_out(opened)) is not None:
-        say(others)
+        (aside if is_json() else say)(others)
     judged = judge_scans(scans, scanner)
     if not len(judged.returns.ring) or not len(judged.rays.ring):
         raise InputError(
             root, "no smooth patches in its scans", "nothing can be judged from these: give scans of streets"
         )
-    figures: dict[str, Any] = {**figures_of(noise, judged), **clump_figures(opened, scanner)}
+    figures: dict[str, Any] = {"program_version": augkitti.__version__}
+    figures |= {**figures_of(noise, judged), **clump_figures(opened, scanner)}
     figures |= {"scans": len(scans), "profile": noise.name}
     figures |= {"shipped": noise.shipped, "shipped_drop": noise.shipped_drop}
-    for line in table(figures):
-        say(line)
+    if is_json():
+        print_json(figures)
+    else:
+        for line in table(figures):
+            say(line)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        out.write_text(as_json(figures), encoding="utf-8")
     return figures
 
 

@@ -121,7 +121,7 @@ def prepared_scan(
     path = entry_path(cache_folder, ["scan", scan_digest(sequence, frame), sections, profile.digest])
     if path in _recent:
         return _recent[path], False
-    scan = read_scan(sequence, frame)
+    scan = read_scan(sequence, frame, profile.elevation_rad)
     content, made = load(path), False
     try:
         prepared = _unpack(content, scan, profile) if content is not None else None

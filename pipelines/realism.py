@@ -9,7 +9,6 @@ view: `realism_features`; classifiers: `two_sample`; the page: `realism_report`.
 import itertools
 import json
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
+import augkitti
 from augkitti import kitti as kitti_disk
 from augkitti import realism_features as rf
+from augkitti.command_line import aside, counted, is_json, print_json
 from augkitti.errors import InputError
 from augkitti.frames import F64
 from augkitti.labelled_views import body_return_rate, clump_correlations, clump_sums, vehicle_views, window_shares
@@ -209,7 +210,7 @@ def realism(
     its_profile = _profile_of(out_set, profile)
     root, source = _root_of(kitti, its_profile)
     models = _models_of(cad)
-    print(f"labelled cars of {source}, {len(models)} car models", file=sys.stderr)
+    aside(f"labelled cars of {source}, {len(models)} car models")
     gathered = gather(root, models, its_profile, wanted, seed, max_tracks, views_of_a_track, resimulate)
     if out_set is not None:
         _add_set(gathered, out_set, its_profile, seed)
@@ -222,8 +223,11 @@ def realism(
     held_out = "" if is_synthetic else " Where these same cars are among that, the figures are not held out."
     found.notes.append(f"The sensor model was learned from: {source_of_noise}.{held_out}")
     write_report(found, report)
-    print(found.verdict)
-    print(report / "index.html")
+    if is_json():
+        print_json(as_json(found))
+    else:
+        print(found.verdict)
+        print(report / "index.html")
     return 0 if all(check.passed for check in found.checks) else 1
 
 
@@ -287,7 +291,8 @@ def gather(
     gathered = Gathered(columns={name: [] for name in columns})
     per_track: dict[str, list[int]] = {}
     common = common_rays(profile)
-    for view in vehicle_views(root, profile, min_points=MIN_POINTS, most_covered=MAX_COVERED, range_m=RANGE_M):
+    views = vehicle_views(root, profile, min_points=MIN_POINTS, most_covered=MAX_COVERED, range_m=RANGE_M)
+    for view in counted(views, None, "views"):
         frames = per_track.setdefault(view.track, [])
         if len(frames) >= views_of_a_track:
             continue
@@ -395,7 +400,7 @@ def _add_set(gathered: Gathered, folder: Path, profile: ScannerProfile, seed: in
     else:
         gathered.columns[SET] = [found[b] for _, b in matches]
         gathered.set_matched = [a for a, _ in matches]
-    print(gathered.set_note, file=sys.stderr)
+    aside(gathered.set_note)
 
 
 def match(real: Sequence[Summary], others: Sequence[Summary], most: float = 4.0) -> list[tuple[int, int]]:
@@ -449,7 +454,8 @@ def judge(
     equal: dict[str, AtEqualCounts] = {}
     drops: dict[str, float] = {}
     if count >= 2:
-        judged = {name: _told_apart(gathered, name, X_real, X, scorer, seed, 3) for name in X}
+        columns = counted(X, len(X), "columns judged")
+        judged = {name: _told_apart(gathered, name, X_real, X, scorer, seed, 3) for name in columns}
         in_place = {name: one for name, one in judged.items() if name != SET}
         boot = bootstrap_auc(in_place, resamples, rng, sorted(set(tracks)))
         boot |= bootstrap_auc({name: one for name, one in judged.items() if name == SET}, resamples, rng)
@@ -459,7 +465,8 @@ def judge(
         else:
             clouds = {name: _clouds(views, rng) for name, views in gathered.columns.items() if views}
             cloud_real = _clouds(real, rng)
-            points_judged = {name: _told_apart(gathered, name, cloud_real, clouds, network, seed, 1) for name in clouds}
+            columns = counted(clouds, len(clouds), "point networks")
+            points_judged = {n: _told_apart(gathered, n, cloud_real, clouds, network, seed, 1) for n in columns}
     if count >= 4:
         beside: dict[str, F64] = {name: X[name] for name in ("full", "common") if name in X}
         equal = at_equal_counts(X_real, beside, tracks, scorer, splits, rng)
@@ -775,6 +782,7 @@ def as_json(found: Findings) -> dict[str, Any]:
         return judged[name].auc if name in judged else math.nan
 
     out = {
+        "program_version": augkitti.__version__,
         "verdict": found.verdict,
         "tracks": found.tracks,
         "views": len(found.gathered.real),

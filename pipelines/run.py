@@ -31,7 +31,7 @@ from augkitti.errors import InputError, MachineError
 from augkitti.kitti import KittiRoot, Sequence, known_ego_motion, label_reach, open_root, read_labels
 from augkitti.remote import as_path, copy_here, is_remote, remove_all
 from augkitti.scan_pair import CarModel
-from augkitti.scanner import ScannerProfile, load_profile
+from augkitti.scanner import ScannerProfile, is_shipped, load_profile
 from augkitti.sensor_noise import noise_model, solid_noise
 from augkitti.shards import read_metadata, shard_metadata
 from pipelines.cache import cache_folder, program_digest
@@ -328,7 +328,7 @@ def start_work(run: Run, resume: bool) -> None:
         "n": options.n,
         "seed": options.seed,
         "config": options.config.model_dump(mode="json"),
-        "profile": None if options.profile is None else str(options.profile.absolute()),
+        "profile": None if options.profile is None else _profile_place(options.profile),
         "stop_on_error": options.stop_on_error,
         "cache": str(options.cache.absolute()),
     }
@@ -374,6 +374,11 @@ def reopen_run(out: Path) -> Run:
         raise InputError(state, problem, "see that it is there, or begin again in another folder") from err
     start_work(run, resume=True)
     return run
+
+
+def _profile_place(profile: Path) -> str:
+    """A profile as `run.json` names it: a shipped one's name is no path."""
+    return str(profile if is_shipped(profile) else profile.absolute())
 
 
 def _place(given: Any) -> Path | None:

@@ -1,4 +1,4 @@
-"""One stage: independent tasks in, their results out as they come, with progress on a terminal.
+"""One stage: independent tasks in, their results out as they come, with progress.
 
 A task gets one thread for arithmetic: workers do not fight over cores, and no sum depends on how many there are.
 Tasks run in processes of this machine, or on the workers of a Dask scheduler; joblib hands them out either way.
@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 
 from joblib import Parallel, delayed, parallel_config
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from augkitti.command_line import progress
 from augkitti.errors import InputError, MachineError
 from pipelines.cache import program_digest
 
@@ -52,8 +52,6 @@ def run_tasks(
         MachineError: a worker process died (with a scheduler: several under one task), or is of another program.
     """
     total = sum(weight(item) for item in items)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[rate]}"))
-    quiet = not sys.stderr.isatty()
     with ExitStack() as stack:
         if scheduler is None:
             stack.enter_context(parallel_config(backend="loky", inner_max_num_threads=1))
@@ -62,16 +60,11 @@ def run_tasks(
             client = stack.enter_context(_connected(scheduler))
             stack.enter_context(parallel_config(backend=_on_workers(client)))
             workers, ahead, weighed, here = -1, f"2 * n_jobs + {_AHEAD}", _on_worker, program_digest()
-        bar = stack.enter_context(
-            Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True), disable=quiet)
-        )
-        line = bar.add_task(what, total=total, rate="")
+        advance = stack.enter_context(progress(total, what))
         try:
             run = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1, pre_dispatch=ahead)
             for result, done in run(delayed(weighed)(task, item, weight(item), here) for item in items):
-                bar.advance(line, done)
-                speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
-                bar.update(line, rate=f"{speed:.1f} {what}/s" if speed else "")
+                advance(done)
                 yield result
         except BrokenProcessPool as err:
             problem = "a worker process was killed, as happens when memory runs out"

@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from augkitti.command_line import progress
 from augkitti.errors import InputError
 from augkitti.kept_folder import is_whole, put_folder
 from augkitti.scanner import ScannerProfile
@@ -86,7 +87,9 @@ def make_streets(streets: Streets, profile: ScannerProfile, jobs: int) -> None:
     try:
         above.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{streets.folder.name}.part-", dir=above) as part:
-            synthesize(Path(part) / "made", streets.drives, streets.frames, streets.seed, profile, jobs)
+            with progress(streets.drives, "streets") as done:
+                made = Path(part) / "made"
+                synthesize(made, streets.drives, streets.frames, streets.seed, profile, jobs, done)
             put_folder(Path(part) / "made", streets.folder)
     except OSError as err:
         raise InputError(streets.folder, f"cannot be written ({err.strerror})", "set AUGKITTI_CACHE") from err

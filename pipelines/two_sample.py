@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from augkitti.command_line import counted
 from augkitti.errors import InputError
 from augkitti.frames import F64, Array
 from augkitti.scan_pair import I64, Bool
@@ -116,7 +117,7 @@ def bootstrap_auc(
     place = {name: index for index, name in enumerate(names)}
     index = {key: np.array([place[track] for track in one.track]) for key, one in judged.items()}
     out = {key: np.zeros(resamples) for key in judged}
-    for k in range(resamples):
+    for k in counted(range(resamples), resamples, "resamples"):
         times = np.bincount(rng.integers(len(names), size=len(names)), minlength=len(names)).astype(np.float64)
         for key, one in judged.items():
             out[key][k] = auc(one.score, one.is_simulated, one.weight * times[index[key]])
@@ -220,7 +221,7 @@ def at_equal_counts(
     of_view = np.asarray(tracks)
     everyone = {"real": real, **others}
     found: dict[str, list[tuple[float, float]]] = {name: [] for name in everyone}
-    for _ in range(splits):
+    for _ in counted(range(splits), splits, "splits"):
         half = set(rng.permutation(names)[: len(names) // 2])
         first = np.array([track in half for track in of_view])
         seed = int(rng.integers(2**31))

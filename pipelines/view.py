@@ -5,13 +5,13 @@ Pages are made in a folder beside the one asked for, which is renamed when all i
 
 import os
 import shutil
-import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from augkitti.command_line import aside, note
 from augkitti.config import Config
 from augkitti.dataset import Dataset, open_dataset
 from augkitti.errors import InputError
@@ -69,7 +69,7 @@ def view(
         view_pair(folder, pair_id, out, kitti)
         return out
     page = write_pages(folder, pair_id, DEFAULT_PAGES if out is None else out, kitti, cad, pairs, jobs)
-    print(page)
+    note(str(page))
     return page
 
 
@@ -84,12 +84,12 @@ def view_in_rerun(folder: Path, pair_id: str | None, out: Path | None, kitti: Pa
     dataset = _open(folder)
     pair = dataset[0 if pair_id is None else pair_id]
     source = _Source.of(dataset, kitti)
-    removed, note = source.removed(pair)
+    removed, why = source.removed(pair)
     send_to_rerun(pair, removed, out)
     if removed is None and (len(pair.scan0.removed) or len(pair.scan1.removed)):
-        print(f"removed points are not shown: {note}", file=sys.stderr)
+        aside(f"removed points are not shown: {why}")
     if out is not None:
-        print(out)
+        note(str(out))
 
 
 def write_pages(
@@ -118,9 +118,9 @@ def write_pages(
                 (part / name).mkdir(parents=True)
             write_static_files(part)
             items = list(enumerate(chosen))
-            for place, row, note in run_tasks(task, items, jobs, "pages", weight=lambda item: 1):
+            for place, row, why in run_tasks(task, items, jobs, "pages", weight=lambda item: 1):
                 rows[place] = row
-                notes += [note] if note else []
+                notes += [why] if why else []
             write_index_page(
                 part / "index.html",
                 [rows[place] for place in sorted(rows)],
@@ -135,13 +135,13 @@ def write_pages(
             raise InputError(out, f"cannot be written ({err.strerror})", "name another folder, or make room") from err
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    for note in sorted(set(notes)):
-        print(f"removed points are not shown: {note}", file=sys.stderr)
+    for why in sorted(set(notes)):
+        aside(f"removed points are not shown: {why}")
     large = sum(row.page_bytes > MOST_PAGE_BYTES for row in rows.values())
     if large:
-        print(f"{large} pages are larger than {MOST_PAGE_BYTES / 1e6:.0f} MB and may open slowly", file=sys.stderr)
+        aside(f"{large} pages are larger than {MOST_PAGE_BYTES / 1e6:.0f} MB and may open slowly")
     if len(chosen) < len(numbers):
-        print(f"{len(chosen)} of {len(numbers):,} pairs, evenly spread; --pairs shows more", file=sys.stderr)
+        aside(f"{len(chosen)} of {len(numbers):,} pairs, evenly spread; --pairs shows more")
     return out / "index.html"
 
 
@@ -218,8 +218,8 @@ def _write_page(
     """Write one pair's page and picture; its place, its row of the index, and why removed points are missing."""
     place, number = item
     pair = dataset[number]
-    removed, note = source.removed(pair)
-    data = pair_data(pair, source.profile, models, removed, note)
+    removed, why = source.removed(pair)
+    data = pair_data(pair, source.profile, models, removed, why)
     page = f"{names[place]}.html"
     before = f"{names[place - 1]}.html" if place else None
     after = f"{names[place + 1]}.html" if place + 1 < len(names) else None
@@ -245,4 +245,4 @@ def _write_page(
         labelled=len(pair.objects) - len(cars),
         page_bytes=size,
     )
-    return place, row, note
+    return place, row, why

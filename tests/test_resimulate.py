@@ -135,7 +135,7 @@ def cars_with(scores: np.ndarray, seed: int) -> list[fit_vehicles.FittedView]:
 
 def test_a_fit_recovers_planted_paint_incidence_and_zeros() -> None:
     planted = np.linspace(-2.0, 1.0, 24)
-    noise, found = fit_vehicles.fit_strength(cars_with(planted, seed=1))
+    noise, found = fit_vehicles.fit_strength(cars_with(planted, seed=1), PROFILE.ring_step_rad)
     shipped = PROFILE.content["noise"]
     level = noise["paint"]["strength"] - shipped["paint"]["strength"]
     assert np.corrcoef(found, planted)[0, 1] > 0.95

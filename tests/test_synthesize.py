@@ -160,8 +160,8 @@ def test_boxes_are_poses_at_the_moment_the_scanner_looks_at_them(sequences):
     from augkitti.scanner import azimuth_time
     from augkitti.seeds import generator
 
-    street = drive_street(SEED, 0, FRAMES)
-    ego = ego_truth(street, FRAMES, generator(SEED, "clock", 0))
+    street = drive_street(SEED, 0, FRAMES, PROFILE.period_s)
+    ego = ego_truth(street, FRAMES, PROFILE.period_s, generator(SEED, "clock", 0))
     scan = kitti.read_scan(sequences[0], 1)
     found = 0
     for label in kitti.read_labels(sequences[0], 1):

@@ -253,6 +253,17 @@ def test_tick_that_was_not_fired_is_found(pair):
     assert 7 in found(with_scan(pair, 1, tick=changed(pair.scan1.tick, row, pair.scan1.tick[row] + 1)))
 
 
+def test_a_tick_whose_every_measured_return_a_car_hides_was_fired_all_the_same(pair, source):
+    tick = pair.scan1.tick[simulated(pair.scan1)]
+    gone = (pair.scan1.source >= 0) & (pair.scan1.tick == tick)
+    names = ("xyz", "reflectance", "ring", "tick", "source", "instance", "surface")
+    scan = {name: getattr(pair.scan1, name)[~gone] for name in names}
+    scan["removed"] = np.sort(np.concatenate([pair.scan1.removed, pair.scan1.source[gone]]))
+    hidden = with_scan(pair, 1, **scan)
+    assert gone.any()
+    assert not any("not fired" in offence.message for offence in validate_pair(hidden, RULES, source))
+
+
 def test_doubled_ray_is_found(pair):
     row = simulated(pair.scan1)
     names = ("xyz", "reflectance", "ring", "tick", "source", "instance", "surface")

@@ -13,9 +13,15 @@ from typing import Annotated, Literal
 
 import typer
 
+from augkitti import command_line
 from augkitti.errors import InputError, MachineError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+class _Group(command_line.Group):
+    json_may_name_a_file = ("evaluate",)
+
+
+app = typer.Typer(cls=_Group, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 Data = Annotated[
     list[str],
@@ -44,8 +50,11 @@ def _pointflownet(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Nothing but errors and what was asked for.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Versions; the traceback behind an error.")] = False,
 ) -> None:
     """PointFlowNet: scene flow, cars and their rigid motion from two LiDAR scans."""
+    command_line.begin(quiet, verbose)
 
 
 @contextmanager
@@ -56,9 +65,11 @@ def _answers(needs_torch: bool = True, at_interrupt: str = "") -> Iterator[None]
             _find_torch()
         yield
     except InputError as err:
+        command_line.trace()
         print(f"pointflownet: {err}", file=sys.stderr)
         raise typer.Exit(2) from None
     except MachineError as err:
+        command_line.trace()
         print(f"pointflownet: {err}", file=sys.stderr)
         raise typer.Exit(3) from None
     except KeyboardInterrupt:
@@ -124,7 +135,10 @@ def evaluate(
         Path | None, typer.Argument(metavar="[RUN]", help="A run's folder or checkpoint. Without: the shipped one.")
     ] = None,
     split: Annotated[str, typer.Option(help="train, validation or test; all: no splits needed.")] = "test",
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the figures there.")] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="[FILE]", help="Print JSON instead of tables; with a file: write it there, too."),
+    ] = None,
     csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the rows there.")] = None,
     tex: Annotated[Path | None, typer.Option(metavar="FILE", help="Write rows as the paper's LaTeX there.")] = None,
     predictions: Annotated[
@@ -147,10 +161,12 @@ def evaluate(
         from training.evaluate import EvaluateOptions
         from training.evaluate import evaluate as score
 
+        command_line.json_alone(json == Path("-"))
         score(
             EvaluateOptions(
                 run=run, data=tuple(data), split=None if split == "all" else split,
-                json=json, csv=csv, tex=tex, predictions=predictions, pictures=pictures, limit=limit,
+                json=None if json == Path("-") else json, csv=csv, tex=tex, predictions=predictions,
+                pictures=pictures, limit=limit,
                 neutral=() if neutral == "none" else tuple(name.strip() for name in neutral.split(",")),
                 least_points=least_points, threads=threads, device=device, precision=precision,
             )
@@ -248,7 +264,7 @@ def _weighted(data: list[str]) -> tuple[tuple[Path, float], ...]:
 
 def main() -> None:
     """Entry point of the command."""
-    app()
+    app(prog_name="pointflownet")
 
 
 if __name__ == "__main__":

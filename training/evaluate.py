@@ -4,20 +4,21 @@ Scoring itself is `score.py`, which needs no torch; this module predicts, reads 
 """
 
 import hashlib
+import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
 from pydantic import ValidationError
 
+import augkitti
+from augkitti.command_line import counted, is_json, note
 from augkitti.dataset import Dataset, open_dataset
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
@@ -34,8 +35,6 @@ from training.score import Report, Rules, baseline_predictors, score_pairs
 from training.team import Precision, Team, team_of
 
 METHOD = "direct"  # whose best, median and worst pairs are drawn, where it is among the methods
-_SAY_EVERY_S = 15.0
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def evaluate(options: EvaluateOptions) -> Report:
         if file is not None and file.exists():
             found = stack.enter_context(Predictions(file))
             settings = _settings_of(found, options.run)
-            print(f"{file}: {len(found):,} predictions, scored as they are", flush=True)
+            note(f"{file}: {len(found):,} predictions, scored as they are")
         else:
             if file is None:
                 file = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "predictions.parquet"
@@ -93,14 +92,17 @@ def evaluate(options: EvaluateOptions) -> Report:
         if options.least_points is not None:
             rules = replace(rules, least_points=options.least_points)
         predictors = [lambda pair: found.of(pair.pair_id, len(pair.scan0)), *baseline_predictors()]
-        pairs = with_progress("scored", sets.pairs(options.limit), sets.count(options.limit))
+        pairs = counted(sets.pairs(options.limit), sets.count(options.limit), "pairs scored")
         about = {key: value for key, value in found.about.items() if key != "settings"}
         report = score_pairs(pairs, predictors, rules).report(about)
         evaluated_on = "+".join(path.resolve().name for path in options.data)
         _write(options.json, as_json, report)
         _write(options.csv, as_csv, report)
         _write(options.tex, lambda its: as_latex(its, evaluated_on), report)
-        print_report(report)  # after the files: its reader may leave early
+        if is_json():
+            sys.stdout.write(as_json(report))
+        else:
+            print_report(report)  # after the files: its reader may leave early
         if options.pictures is not None:
             _draw(options.pictures, report, sets, found, rules)
     return report
@@ -189,23 +191,13 @@ def open_split(folder: Path, split: str | None) -> Dataset:
     return data
 
 
-def with_progress(what: str, items: Iterable[_Item], total: int) -> Iterator[_Item]:
-    """The items; now and then, and at the end, a line says how many are done and how long each takes."""
-    start = said = time.perf_counter()
-    for done, item in enumerate(items, start=1):
-        yield item
-        now = time.perf_counter()
-        if now - said > _SAY_EVERY_S or done == total:
-            said = now
-            print(f"{what} {done:,} of {total:,} pairs, {(now - start) / done:.2f} s each", flush=True)
-
-
 def _predict_to(file: Path, sets: _Sets, options: EvaluateOptions) -> Settings:
     """Predict all pairs to a file; the network's settings."""
     path = shipped_checkpoint() if options.run is None else options.run
     checkpoint = load_checkpoint(path)
     network = network_of(checkpoint, path)
     about = {
+        "program_version": augkitti.__version__,
         "checkpoint": "shipped" if options.run is None else path.resolve().name,
         "weights": _fingerprint(checkpoint),
         "step": checkpoint.step,
@@ -215,7 +207,7 @@ def _predict_to(file: Path, sets: _Sets, options: EvaluateOptions) -> Settings:
     }
     with team_of(options.device, options.precision) as team:
         predictor = Predictor(network, checkpoint.settings, team)
-        pairs = with_progress("predicted", sets.pairs(options.limit), sets.count(options.limit))
+        pairs = counted(sets.pairs(options.limit), sets.count(options.limit), "pairs predicted")
         try:
             write_predictions(file, predict_pairs(predictor, pairs), about)
         except OSError as err:
@@ -280,4 +272,4 @@ def _draw(folder: Path, report: Report, sets: _Sets, found: Predictions, rules: 
             true_boxes=np.array([item.box0 for item in pair.objects if item.box0 is not None]).reshape(-1, 7),
             title=f"{which} pair by {method} flow: {name}, {figures}",
         )  # fmt: skip
-        print(f"{folder / f'{which}.png'}: {name}")
+        note(f"{folder / f'{which}.png'}: {name}")

@@ -16,13 +16,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from augkitti.command_line import counted
 from augkitti.dataset import Dataset
 from augkitti.errors import InputError
 from augkitti.scan_pair import AugmentedPair
 from training.baselines import Method
 from training.baselines.followed import sure, true_boxes
 from training.checkpoint import load_checkpoint, network_of, shipped_checkpoint
-from training.evaluate import open_split, with_progress
+from training.evaluate import open_split
 from training.paper_tables import BASELINE, NETWORK, OURS, SETS, Row, lines_of, paper_figures
 from training.predict import Predictor
 from training.predictions import Prediction
@@ -151,12 +152,12 @@ def compare(sets: PaperSets, runs: Sequence[TrainedRun], compared: Sequence[Comp
     """Every run on the validation splits; those of K+AK and every method on the test splits."""
     rules = Rules.of(runs[0].predictor.settings)
     ablation, comparison = _Book(1, rules), _Book(2, rules)
-    for name, _, _, pair in with_progress("validation: scored", sets.pairs("validation"), sets.count("validation")):
+    for name, _, _, pair in counted(sets.pairs("validation"), sets.count("validation"), "pairs of validation scored"):
         for run in runs:
             ablation.add(name, run.name, pair, *_timed(partial(run.predictor, pair)))
     mixed = [run for run in runs if run.trained_on == MIXED]
     close: list[CloseCars] = []
-    for name, number, count, pair in with_progress("test: scored", sets.pairs("test"), sets.count("test")):
+    for name, number, count, pair in counted(sets.pairs("test"), sets.count("test"), "pairs of test scored"):
         first: Prediction | None = None
         for run in mixed:
             prediction, seconds = _timed(partial(run.predictor, pair))

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from scipy.special import expit
 
+import augkitti
+from augkitti.command_line import note
 from augkitti.errors import InputError, MachineError
 from augkitti.frames import F32, F64
 from augkitti.scan_pair import I64, AugmentedPair, Bool
@@ -256,13 +258,14 @@ def predict_files(
         "boxes": boxes,
         "motions": motions,
         "scores": scores,
+        "program_version": np.array(augkitti.__version__),
     }
     try:
         replace_whole(out, lambda file: np.savez_compressed(file, **arrays))
     except OSError as err:
         raise MachineError(out, f"cannot be written ({err.strerror})", "free space, or give another --out") from err
     share = empty_share(batch.voxels0, settings.grid)
-    print(
+    note(
         f"{out}: {where.sum():,} of {len(where):,} points in the grid, {len(boxes)} cars, ego-motion {T[0, 3]:.2f}, "
         f"{T[1, 3]:.2f} m, {np.arctan2(T[1, 0], T[0, 0]):.4f} rad; {share:.1%} of the voxels of scan 0 are empty "
         '(paper: "more than 90 %")'
@@ -272,7 +275,7 @@ def predict_files(
             picture, first.xyz, flows["direct"], where, limits_of(settings.grid), T, boxes, motions, scores,
             title=f"{name}: {len(boxes)} cars",
         )  # fmt: skip
-        print(f"{picture}: the flow from above")
+        note(f"{picture}: the flow from above")
     return prediction
 
 

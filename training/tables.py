@@ -17,6 +17,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+import augkitti
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
 from training.baselines import ego_registration, ego_true, zero
@@ -104,8 +105,9 @@ def tables(options: TablesOptions, compared: Sequence[Compared] | None = None) -
         found.about.update(_about(options, runs, team))
         _print_tables(found.rows)
         again = Again(sets, runs, compared, options.boxes, found.rules)
-        content = json.dumps(finite(found.as_json()), indent=1, allow_nan=False) + "\n"
-        _write(options.out / "tables.json", content)  # before the figures: minutes of scoring are safe then
+        content = finite({"program_version": augkitti.__version__, **found.as_json()})
+        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        _write(options.out / "tables.json", text)  # before the figures: minutes of scoring are safe then
         _write(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
         pictures = draw_all(options.out / "figures", found, again, runs[-1].predictor.network, options.fig3b)
     _write(options.out / "index.html", page_of(found, pictures))

@@ -22,6 +22,7 @@ import yaml
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
+from augkitti.command_line import note
 from augkitti.errors import InputError, MachineError
 from training.checkpoint import (
     NAME,
@@ -338,7 +339,7 @@ class Log:
     def say(self, line: str) -> None:
         """Print it, once for all processes."""
         if self.team.leads:
-            print(line, flush=True)
+            note(line)
 
     def step(self, run: Run, figures: Mapping[str, float], pairs: int, final: bool) -> None:
         """A step is done."""
