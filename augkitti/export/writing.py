@@ -108,7 +108,7 @@ def export_pairs(dataset: Dataset, export: Export, ground: GroundConfig, profile
             stale.unlink()
         _put(out, {EXPORT_NAME: _state(export.identity, finished=False)})
         done = dict(export.done)
-        with (out / PAIRS_NAME).open("ab") as journal:
+        with (out / PAIRS_NAME).open("ab", buffering=0) as journal:
             journal.write(b"\n")  # ends a line that a killed run left half
             number = 0
             for shard in dataset.shards:
@@ -119,7 +119,6 @@ def export_pairs(dataset: Dataset, export: Export, ground: GroundConfig, profile
                     sizes = _put(out, form.files(pair, scene))
                     one = Done(scene.number, pair.pair_id, scene_name(pair), nanoseconds(pair), sizes)
                     journal.write(_line(one))
-                    journal.flush()
                     done[one.number] = one
                     yield one
                 number += shard.rows
