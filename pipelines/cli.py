@@ -358,6 +358,25 @@ def croissant(
 
 
 @app.command()
+def export(
+    folder: Folder = DEFAULT_OUT,
+    form: Annotated[
+        str,
+        typer.Option("--format", metavar="F", help="opensceneflow, av2, semantickitti, kitti-object, hplflownet."),
+    ] = "",
+    out: Annotated[Path | None, typer.Option(parser=_place, metavar="DIR", help="Folder of the export.")] = None,
+    split: Annotated[str | None, typer.Option(help="train, validation or test. Without: all pairs.")] = None,
+) -> None:
+    """Write the data set in a form that other programs read; an interrupted export goes on. See docs/exports.md."""
+    with _answers("; finished pairs are kept, the same command goes on"):
+        from pipelines.export import export_set
+
+        if out is None:
+            raise InputError("--out", "not given", "name a folder for the export")
+        export_set(folder, form, out, split)
+
+
+@app.command()
 def synthesize(
     out: Out,
     drives: Annotated[int, typer.Option(min=1, help="Streets.")] = 10,
