@@ -23,7 +23,7 @@ from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-STUBS = ("pip", "make", "dask", "torchrun", "docker", "git")
+STUBS = ("pip", "make", "dask", "torchrun", "docker", "git", "kiss_icp_pipeline")
 CLIENT = """#!{python} -SE
 import json, os, socket, sys
 call = {{"program": {program!r}, "words": sys.argv[1:], "folder": os.getcwd(), "environment": dict(os.environ)}}
@@ -124,7 +124,7 @@ def run(program: str, words: list[str]) -> int:
     if program == "python":
         if checked:
             return check_python(words)
-        exec(compile(sys.stdin.read() if words == ["-"] else Path(words[0]).read_text(), "block", "exec"), {})
+        exec(compile(_program(words), "block", "exec"), {})
         return 0
     from pipelines.cli import app as augkitti
     from training.cli import app as pointflownet
@@ -135,6 +135,13 @@ def run(program: str, words: list[str]) -> int:
         return 0
     app(small(words) if program == "augkitti" else words)
     return 0  # it ends by SystemExit
+
+
+def _program(words: list[str]) -> str:
+    """What `python -`, `python -c PROGRAM` or `python FILE` runs."""
+    if words == ["-"]:
+        return sys.stdin.read()
+    return words[1] if words[0] == "-c" else Path(words[0]).read_text()
 
 
 def parse(app: object, program: str, words: list[str]) -> None:
@@ -189,8 +196,8 @@ def check_other(program: str, words: list[str]) -> int:
 
 
 def check_python(words: list[str]) -> int:
-    if words == ["-"]:
-        compile(sys.stdin.read(), "block", "exec")
+    if words[0] in ("-", "-c"):
+        compile(_program(words), "block", "exec")
     elif words[:2] == ["-m", "torch.distributed.run"]:
         return check_other("torchrun", words[2:])
     elif words[0] == "-m" and words[1] in ("pipelines", "training", "augkitti"):
