@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from augkitti import command_line
+
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -17,6 +19,12 @@ def pytest_sessionfinish() -> None:
 
 def pytest_unconfigure() -> None:
     faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.fixture(autouse=True)
+def _usual_manner() -> None:
+    """No test hears how quiet a command of another was told to be."""
+    command_line.begin(quiet=False, verbose=False)
 
 
 @pytest.fixture(scope="session")

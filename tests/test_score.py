@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from rich.console import Console
 from scored_pair import EGO, SIZE, an_object, make_pair, right
 
+from augkitti.command_line import as_json
 from augkitti.errors import InputError
 from augkitti.frames import compose, pose_from_xyz_yaw, transform_points
 from training.config import GridConfig, load_settings
 from training.predictions import Prediction
-from training.report_tables import as_csv, as_json, as_latex, pairs_csv, print_report, write_report
+from training.report_tables import as_csv, as_latex, pairs_csv, print_report, write_report
 from training.score import Rules, Score, baseline_predictors, score_pairs, truth_of
 
 RULES = Rules()
@@ -373,7 +374,7 @@ def report():
 
 
 def test_json_has_the_rows_with_null_where_there_is_nothing(report):
-    written = json.loads(as_json(report))
+    written = json.loads(as_json(report.as_json()))
     assert [row["method"] for row in written["rows"]] == ["direct", "zero", "ego_true", "ego_registration"]
     for row in written["rows"]:
         assert set(row) >= ROW_KEYS

@@ -4,7 +4,6 @@ Scoring itself is `score.py`, which needs no torch; this module predicts, reads 
 """
 
 import hashlib
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -18,7 +17,7 @@ import torch
 from pydantic import ValidationError
 
 import augkitti
-from augkitti.command_line import counted, is_json, note
+from augkitti.command_line import as_json, counted, is_json, note, print_json
 from augkitti.dataset import Dataset, open_dataset
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
@@ -30,7 +29,7 @@ from training.network import PointFlowNet
 from training.pictures import draw_flow
 from training.predict import Predictor, limits_of, predict_pairs
 from training.predictions import Predictions, write_predictions
-from training.report_tables import as_csv, as_json, as_latex, print_report
+from training.report_tables import as_csv, as_latex, print_report
 from training.score import Report, Rules, baseline_predictors, score_pairs
 from training.team import Precision, Team, team_of
 
@@ -96,11 +95,11 @@ def evaluate(options: EvaluateOptions) -> Report:
         about = {key: value for key, value in found.about.items() if key != "settings"}
         report = score_pairs(pairs, predictors, rules).report(about)
         evaluated_on = "+".join(path.resolve().name for path in options.data)
-        _write(options.json, as_json, report)
+        _write(options.json, lambda it: as_json(it.as_json()), report)
         _write(options.csv, as_csv, report)
         _write(options.tex, lambda its: as_latex(its, evaluated_on), report)
         if is_json():
-            sys.stdout.write(as_json(report))
+            print_json(report.as_json())
         else:
             print_report(report)  # after the files: its reader may leave early
         if options.pictures is not None:

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from augkitti.command_line import as_json
 from augkitti.dataset_index import write_text
 from training.score import Report
 
@@ -112,11 +112,6 @@ def as_latex(report: Report, evaluated_on: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
-def as_json(report: Report) -> str:
-    """`{"rows": [...], "rules": {...}, "about": {...}}`; null where a method has no such figure."""
-    return json.dumps(finite(report.as_json()), indent=1, allow_nan=False) + "\n"
-
-
 def pairs_csv(report: Report) -> str:
     """A line a pair and method: errors of flow and ego-motion; to find the pairs that a method fails on."""
     out = io.StringIO()
@@ -130,7 +125,7 @@ def pairs_csv(report: Report) -> str:
 def write_report(report: Report, folder: Path) -> None:
     """`scores.json`, `scores.csv`, `scores.tex` and `pairs.csv` in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "scores.json", as_json(report))
+    write_text(folder / "scores.json", as_json(report.as_json()))
     write_text(folder / "scores.csv", as_csv(report))
     write_text(folder / "scores.tex", as_latex(report))
     write_text(folder / "pairs.csv", pairs_csv(report))
@@ -207,12 +202,3 @@ def _flat(row: dict[str, Any], before: str = "") -> dict[str, Any]:
         elif not isinstance(value, list):
             out[before + key] = value
     return out
-
-
-def finite(value: Any) -> Any:
-    """With None for what JSON cannot hold."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and value != value else value

@@ -3,7 +3,6 @@
 `COMPARED` is what stands beside the network: one record more is one row more in every file and on the page.
 """
 
-import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-import augkitti
+from augkitti.command_line import as_json
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
 from training.baselines import ego_registration, ego_true, zero
@@ -40,7 +39,6 @@ from training.paper_scores import (
     load_runs,
 )
 from training.paper_tables import FIGURES, REFERENCE, latex_of, lines_of
-from training.report_tables import finite
 from training.tables_page import captions_of, page_of
 from training.team import Precision, Team, team_of
 
@@ -105,9 +103,8 @@ def tables(options: TablesOptions, compared: Sequence[Compared] | None = None) -
         found.about.update(_about(options, runs, team))
         _print_tables(found.rows)
         again = Again(sets, runs, compared, options.boxes, found.rules)
-        content = finite({"program_version": augkitti.__version__, **found.as_json()})
-        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-        _write(options.out / "tables.json", text)  # before the figures: minutes of scoring are safe then
+        # before the figures: minutes of scoring are safe then
+        _write(options.out / "tables.json", as_json(found.as_json()))
         _write(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
         pictures = draw_all(options.out / "figures", found, again, runs[-1].predictor.network, options.fig3b)
     _write(options.out / "index.html", page_of(found, pictures))
