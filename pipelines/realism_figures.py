@@ -13,8 +13,8 @@ import numpy as np
 
 from augkitti import realism_features as rf
 from augkitti.errors import InputError
-from pipelines.realism import AIM_AUC, CLUMPS_OF_31_CARS, SET, Findings, Summary, per_track
 from pipelines.realism_columns import COLUMNS
+from pipelines.realism_findings import AIM_AUC, CLUMPS_OF_31_CARS, SET, Findings, Summary, per_track
 from pipelines.two_sample import interval, mean_known, middle_known, track_weights
 
 # Okabe and Ito's palette: told apart with any colour vision.

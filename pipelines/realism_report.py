@@ -11,9 +11,9 @@ from pathlib import Path
 
 from augkitti import realism_features as rf
 from augkitti.errors import InputError
-from pipelines.realism import SET, Findings, write_json
 from pipelines.realism_columns import COLUMNS
 from pipelines.realism_figures import DARK, LIGHT, FigureOf, figures_of, label_of, render
+from pipelines.realism_findings import SET, Findings, write_json
 from pipelines.two_sample import interval, mean_known, middle_known
 
 

@@ -15,7 +15,7 @@ from augkitti.scan_pair import GLASS, Scan
 from augkitti.scanner import fire_rays, load_profile
 from augkitti.sensor_noise import simulate_returns
 from pipelines import two_sample as ts
-from pipelines.realism import Gathered, as_json, judge, match, realism, summarise
+from pipelines.realism import judge, match, realism, summarise
 from pipelines.realism_columns import (
     cars_of_pair,
     common_rays,
@@ -25,6 +25,7 @@ from pipelines.realism_columns import (
     without_noise,
     without_panes,
 )
+from pipelines.realism_findings import Gathered, as_json
 from pipelines.realism_report import write_report
 
 PROFILE = load_profile()
