@@ -55,6 +55,28 @@ class Group(TyperGroup):
                      for part in ([word, "-"] if word == "--json" and _is_no_file(behind) else [word])]  # fmt: skip
         return list(super().parse_args(ctx, [*first, *words, *args[end:]]))
 
+    def main(self, *args: Any, **more: Any) -> Any:
+        """As `typer` does, but what is wrong with the words is told in one line, as all bad input is."""
+        alone, more["standalone_mode"] = more.get("standalone_mode", True), False
+        if not alone:
+            return super().main(*args, **more)
+        try:
+            code = super().main(*args, **more)
+        except Exception as err:  # click's, of whichever module it comes from
+            if not hasattr(err, "format_message"):
+                raise
+            if type(err).__name__ == "NoArgsIsHelpError":  # no words at all: the help
+                err.show()  # type: ignore[attr-defined]
+                sys.exit(2)
+            program = getattr(getattr(err, "ctx", None), "command_path", self.name)
+            print(f"{program}: {_one_line(err.format_message())}; see {program} --help", file=sys.stderr)
+            sys.exit(2)
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split()).rstrip(".")
+
 
 def _is_no_file(word: str | None) -> bool:
     return word is None or (word.startswith("-") and word != "-")

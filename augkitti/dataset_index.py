@@ -241,9 +241,9 @@ Points and flow are flat lists of x, y, z: `reshape(-1, 3)`; matrices are 4 x 4,
 
 ## Looking
 
-`augkitti view aug` draws a pair, `augkitti info aug` tells and draws the figures of all of them, `augkitti validate
-aug` checks every pair, and `augkitti croissant aug` writes Croissant metadata. No picture lies in this folder, which
-holds data alone; the program's documentation has some.
+`augkitti view aug` shows pairs in a browser, `augkitti info aug` tells and draws the figures of all of them,
+`augkitti validate aug` checks every pair, and `augkitti croissant aug` writes Croissant metadata. No picture lies
+in this folder, which holds data alone; the program's documentation has some.
 
 ## Please cite
 

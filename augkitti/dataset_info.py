@@ -252,7 +252,7 @@ def info_tables(info: Info) -> list["RenderableType"]:
         caption=_spread_line(info),
         caption_justify="left",
     )
-    for name, cars in (("virtual", info.virtual), ("labelled in KITTI", info.labelled)):
+    for name, cars in (("virtual", info.virtual), ("labelled", info.labelled)):
         speed, rate = cars.speed_mps, np.rad2deg(cars.yaw_rate_rps)
         for what, values in (("speed, m/s", speed), ("yaw rate, deg/s", rate)):
             figures = [f"{v:.2f}" for v in _figures(values)] if len(values) else ["-"] * (2 + len(_QUANTILES))
@@ -337,7 +337,7 @@ def draw_info(info: Info, path: Path) -> None:
             (axes[0, 0], np.linspace(0.0, fastest, 26), "speed over ground, m/s", "speed_mps"),
             (axes[0, 1], np.linspace(-turn, turn, 42), "yaw rate, deg/s", "yaw_rate_rps"),
         ):
-            for name, cars, colour in (("virtual", info.virtual, virtual), ("labelled in KITTI", info.labelled, real)):
+            for name, cars, colour in (("virtual", info.virtual, virtual), ("labelled", info.labelled, real)):
                 values = getattr(cars, columns) * (180.0 / np.pi if columns == "yaw_rate_rps" else 1.0)
                 if len(values):
                     weights = np.full(len(values), 100.0 / len(values))

@@ -61,7 +61,7 @@ def command_page() -> str:
         "# Commands",
         "",
         "Made from the programs themselves when this site is built; `augkitti COMMAND --help` says the same.",
-        "What each exit code means stands in [reliability](reliability.md#exit-codes).",
+        "What each exit code means stands in [habits](cli.md).",
         "",
     ]
     for program, group in programs().items():

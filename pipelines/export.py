@@ -28,6 +28,8 @@ def export_set(folder: Path, format_name: str, out: Path, split: str | None) -> 
             is another run's, a damaged shard.
         MachineError: the disk refuses.
     """
+    if not format_name:
+        raise InputError("--format", "not given", f"name one of {', '.join(FORMATS)}")
     form = FORMATS.get(format_name)
     if form is None:
         raise InputError("--format", f"`{format_name}` is not known", f"known are {', '.join(FORMATS)}")

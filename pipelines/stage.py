@@ -145,6 +145,14 @@ def _weighed(task: Callable[[Item], Result], item: Item, weight: int, main: str)
     return task(item), weight
 
 
+class _Pipe(Console):
+    """A console whose reader may leave early: the command answers that, not rich."""
+
+    def on_broken_pipe(self) -> None:
+        """Let the error through."""
+        raise
+
+
 def console() -> Console:
     """Where tables are printed; wide where no terminal says how wide."""
-    return Console() if sys.stdout.isatty() else Console(width=160)
+    return _Pipe() if sys.stdout.isatty() else _Pipe(width=160)

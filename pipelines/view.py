@@ -42,6 +42,7 @@ from pipelines.stage import run_tasks
 DEFAULT_PAGES = Path("augkitti-view")
 DEFAULT_PICTURE = Path("pair.png")
 DEFAULT_PAIRS = 24
+_OTHER_PICTURES = (".jpg", ".jpeg", ".pdf", ".svg", ".gif", ".webp", ".html")
 _NO_SOURCE = "the source scans are not at hand: give --kitti"
 
 
@@ -68,6 +69,8 @@ def view(
     if out is not None and out.suffix.lower() == ".png":
         view_pair(folder, pair_id, out, kitti)
         return out
+    if out is not None and out.suffix.lower() in _OTHER_PICTURES:
+        raise InputError(out, "is no name of a PNG, nor of a folder of pages", "let the picture's name end in .png")
     page = write_pages(folder, pair_id, DEFAULT_PAGES if out is None else out, kitti, cad, pairs, jobs)
     note(str(page))
     return page

@@ -264,3 +264,21 @@ def test_every_module_that_the_architecture_names_is_there():
     named = set(re.findall(r"[a-z_0-9]+\.py", text))
     assert len(named) > 25
     assert named <= there
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["generate", "--n", "0"], "augkitti generate: Invalid value for '--n'"),
+        (["info", "--nosuch"], "augkitti info: No such option: --nosuch"),
+        (["nosuchcommand"], "augkitti: No such command 'nosuchcommand'"),
+    ],
+)
+def test_what_is_wrong_with_the_words_is_told_in_one_line(capsys, words, said):
+    with pytest.raises(SystemExit) as end:
+        app(words, prog_name="augkitti")
+    told = capsys.readouterr().err
+    assert end.value.code == 2
+    assert told.startswith(said)
+    assert told.endswith(" --help\n")
+    assert told.count("\n") == 1

@@ -79,7 +79,7 @@ def test_every_figure_that_the_data_can_give_is_drawn(tmp_path, monkeypatch):
         a_data_set(tmp_path / name)
     for seed, name in enumerate(("k0", "ka0", "ka1")):
         a_run(tmp_path / name, seed=seed)
-    monkeypatch.setattr(module, "find_example", lambda pair: None)  # a few hundred points are no street
+    monkeypatch.setattr(module, "find_example", lambda *_: None)  # a few hundred points are no street
     out = tmp_path / "report"
     tables(options(tmp_path, out, fig3b=(1, 1)), QUICK)
     made = {path.stem for path in (out / "figures").iterdir()}

@@ -43,8 +43,6 @@ from augkitti.scanner import load_profile
 from training.pictures import flow_colours
 
 _SEEDS = 40  # tries for a pair in which a car stands where it can be seen well
-_NEAR_M = (6.0, 16.0)  # of the scanner: panes and seats are told apart
-_FROM_THE_SIDE = 0.5  # sine of the bearing from the car's axis: side windows are seen
 _VIEW_M = (-6.0, 44.0, -15.0, 15.0)  # of the workflow: x from, to, y from, to
 _MESH_COLOUR, _GLASS_COLOUR, _POINT_COLOUR = "#D9DDE3", "#BFE3F5", "#555555"
 
@@ -89,8 +87,21 @@ def plain_pair(pair: AugmentedPair) -> ScanPair:
     )
 
 
-def find_example(pair: AugmentedPair) -> Example | None:
-    """Cars put into a plain pair, one of them near the scanner; None where none finds room there.
+@dataclass(frozen=True)
+class Demand:
+    """How well a car must be seen to be shown."""
+
+    distance_m: tuple[float, float]
+    from_the_side: float  # sine of the bearing from the car's axis: side windows are seen
+    inside: int  # points through its panes
+
+
+WELL = Demand((6.0, 16.0), 0.5, 20)  # panes and seats are told apart
+SOMEHOW = Demand((4.0, 30.0), 0.0, 3)
+
+
+def find_example(pair: AugmentedPair, demand: Demand = WELL) -> Example | None:
+    """Cars put into a plain pair, one of them seen as demanded; None where none finds room there.
 
     With opaque panes the same seed gives the same cars in the same places, unless one is then refused: such seeds are
     passed over.
@@ -102,7 +113,7 @@ def find_example(pair: AugmentedPair) -> Example | None:
     models = [model for model in parametric_cars() if model.category == "Car"]
     for seed in range(_SEEDS):
         made = augment_pair(source, models, profile, clear, seed, pair.pair_id, prepared)
-        row = None if made is None else _car_to_show(made)
+        row = None if made is None else _car_to_show(made, demand)
         if made is None or row is None:
             continue
         opaque = augment_pair(source, models, profile, steel, seed, pair.pair_id, prepared)
@@ -111,19 +122,20 @@ def find_example(pair: AugmentedPair) -> Example | None:
     return None
 
 
-def _car_to_show(pair: AugmentedPair) -> int | None:
-    """The virtual car ahead that moves, is near, seen from the side, and has most points through its panes."""
+def _car_to_show(pair: AugmentedPair, demand: Demand) -> int | None:
+    """The virtual car ahead that moves, is seen as demanded, and has most points through its panes."""
     seen = {}
     for row, item in enumerate(pair.objects):
         if item.origin != "virtual" or item.pose0 is None or abs(item.speed or 0.0) < 2.0 or item.pose0[0, 3] < 0.0:
             continue
         scanner = transform_points(invert(item.pose0), np.zeros(3))
         distance = float(np.hypot(scanner[0], scanner[1]))
-        if _NEAR_M[0] < distance < _NEAR_M[1] and abs(scanner[1]) > _FROM_THE_SIDE * distance:
+        low, high = demand.distance_m
+        if low < distance < high and abs(scanner[1]) >= demand.from_the_side * distance:
             inside = (pair.scan0.instance == row) & (pair.scan0.surface == THROUGH_GLASS)
             seen[row] = int(inside.sum())
     best = max(seen, key=seen.__getitem__, default=None)
-    return best if best is not None and seen[best] >= 20 else None
+    return best if best is not None and seen[best] >= demand.inside else None
 
 
 def _stands_alike(a: AugmentedPair, b: AugmentedPair, row: int) -> bool:

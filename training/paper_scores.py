@@ -46,6 +46,7 @@ class Compared:
     paper: str | None = None  # which of the paper's lines it is to be held against
     most_pairs: int | None = None  # of each set, where it is slow; its row is then of these alone, and says so
     kind: str = BASELINE
+    valid_only: bool = False  # its flow is scored where it has an estimate, as in the paper; the row says on what share
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +234,14 @@ def _run_rows(book: _Book, run: TrainedRun) -> Iterator[dict[str, Any]]:
 def _method_rows(book: _Book, one: Compared, against: str) -> Iterator[dict[str, Any]]:
     for row in book.rows(one.name):
         whole = book.pairs(row["eval_set"], one.name) == book.pairs(row["eval_set"], against)
-        facts = {"trained_on": None, "run": None, "step": None, "kind": one.kind, "whole": whole}
-        yield {**row, **facts, "label": one.label, "paper": paper_figures(2, row["eval_set"], one.paper)}
+        facts: dict[str, Any] = {
+            "trained_on": None, "run": None, "step": None, "kind": one.kind, "whole": whole,
+        }  # fmt: skip
+        label = one.label
+        if one.valid_only:
+            facts["all_points"] = {key: row[key] for key in row["given_only"]}
+            row, label = {**row, **row["given_only"]}, f"{label} (valid {100 * row['coverage']:.0f} %)"
+        yield {**row, **facts, "label": label, "paper": paper_figures(2, row["eval_set"], one.paper)}
 
 
 class Again:
@@ -264,7 +271,7 @@ class Again:
 
 def best_baselines(rows: Sequence[Row], most: int = 2) -> list[str]:
     """Names of the methods with the least foreground error on K+AK; those of fewer pairs and references left out."""
-    lines = [line for line in lines_of(rows, 2) if line.eval_set == MIXED and line.kind == BASELINE and line.whole]
+    lines = [line for line in lines_of(rows, 2) if line.eval_set == MIXED and line.kind == BASELINE and line.contends]
     known = [(line.rows[0]["fg_epe"], line.rows[0]["method"]) for line in lines if line.rows[0]["fg_epe"] is not None]
     return [name for _, name in sorted(known)[:most]]
 

@@ -1,7 +1,8 @@
 """Tables 1 and 2 of the paper: rows of figures in, lines with the paper's numbers beside them out, as HTML and LaTeX.
 
 A row is one of `Report.rows` with a few keys more (`tables.py`): `table`, `eval_set`, `trained_on`, `label`, `kind`,
-`paper`, `run`, `seconds`, `coverage`, `whole`. Layout asks a row for nothing else, so another method is another row.
+`paper`, `run`, `seconds`, `coverage`, `whole`. Where its flow is scored on valid points
+alone, `all_points` has the figures of all. Layout asks a row for nothing else, so another method is another row.
 """
 
 import html
@@ -91,8 +92,8 @@ class Line:
 
     @property
     def contends(self) -> bool:
-        """Whether its figures may be the best of a column: no reference, and on the same pairs as the others."""
-        return self.whole and self.kind != REFERENCE
+        """Whether its figures may be the best of a column: no reference, and on the same points as the others."""
+        return self.whole and self.kind != REFERENCE and self.rows[0].get("all_points") is None
 
     @property
     def paper(self) -> Mapping[str, float | None]:
@@ -242,7 +243,7 @@ def _percent(one: Spread | None) -> str:
 # --- LaTeX ---------------------------------------------------------------------------------------------------------
 
 _LATEX_NONE = "n/a"  # a dash beside the paper's figure would be read as its sign
-_LATEX_HEAD = r"""% Needs booktabs, multirow and xcolor. In grey beside each figure: the paper's.
+_LATEX_HEAD = r"""% Needs booktabs, graphicx and xcolor. In grey beside each figure: the paper's.
 \providecommand{\paper}[1]{\,{\scriptsize\color{gray}#1}}
 """
 
@@ -310,7 +311,8 @@ def _latex_seconds(line: Line) -> str:
 def _latex_table(columns: str, head: str, body: str, caption: str, label: str) -> str:
     return (
         "\\begin{table*}[t]\n\\centering\n"
-        f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{head}\n\\midrule\n{body}\n\\bottomrule\n\\end{{tabular}}\n"
+        "\\resizebox{\\textwidth}{!}{%\n"
+        f"\\begin{{tabular}}{{{columns}}}\n\\toprule\n{head}\n\\midrule\n{body}\n\\bottomrule\n\\end{{tabular}}}}\n"
         f"\\caption{{{caption}}}\n\\label{{{label}}}\n\\end{{table*}}\n"
     )
 

@@ -54,8 +54,8 @@ COMPARED: tuple[Compared, ...] = (
     Compared("3dmatch_strong", "3DMatch+Det., strong", three_d_match_strong, most_pairs=SLOW),
     Compared("fpfh", "FPFH+Det.", fpfh, "FPFH+Det."),
     Compared("fpfh_strong", "FPFH+Det., strong", fpfh_strong),
-    Compared("dewan", "Dewan et al.+Det.", dewan, "Dewan et al.+Det."),
-    Compared("dewan_strong", "Dewan et al.+Det., strong", dewan_strong),
+    Compared("dewan", "Dewan et al.+Det.", dewan, "Dewan et al.+Det.", valid_only=True),
+    Compared("dewan_strong", "Dewan et al.+Det., strong", dewan_strong, valid_only=True),
 )
 
 

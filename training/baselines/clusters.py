@@ -28,7 +28,8 @@ _UNEXPLAINED = 0.15  # share of a cluster's points without one, from which on it
 def ego_icp_clusters(pair: AugmentedPair, _: Prediction | None = None) -> Prediction:
     """Flow by the motion of each point's cluster, by the ego-motion elsewhere; detections are not used.
 
-    Where nothing stands on the ground, all moves with the ego-motion.
+    Where nothing stands on the ground, all moves with the ego-motion, which is none where a scan is empty. Identical
+    scans give no motion.
     """
     xyz0 = pair.scan0.xyz
     ego = register(xyz0, pair.scan1.xyz)

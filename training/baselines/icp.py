@@ -22,7 +22,8 @@ _VOXEL_M = 0.3  # of the background: one point each
 def icp(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
     """The paper's ICP + Det.
 
-    Every motion starts at none. A detection with under 3 points moves with the world; a world with under 3 stands.
+    Every motion starts at none. A detection with under 3 points moves with the world; a world with under 3, or without
+    a second scan, stands. Identical scans give no motion.
     """
     xyz0 = pair.scan0.xyz
     rows = object_points(xyz0, boxes_of(detections))
@@ -39,7 +40,8 @@ def icp(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction
 def icp_strong(pair: AugmentedPair, detections: Prediction | None = None) -> Prediction:
     """ICP + Det. with care.
 
-    A detection with under 3 points, or one that scan 1 holds nothing near, moves with the world.
+    A detection with under 3 points, or one that scan 1 holds nothing near, moves with the world, and that stands where
+    a scan is empty. Identical scans give no motion.
     """
     xyz0 = pair.scan0.xyz
     ego = register(xyz0, pair.scan1.xyz)

@@ -26,7 +26,10 @@ def ego_true(pair: AugmentedPair, _: Prediction | None = None) -> Prediction:
 
 
 def ego_registration(pair: AugmentedPair, _: Prediction | None = None) -> Prediction:
-    """Ego-motion by registration of the two scans (GICP, `augkitti.ego_motion.register`), and a standing world."""
+    """Ego-motion by registration of the two scans (GICP, `augkitti.ego_motion.register`), and a standing world.
+
+    No motion where a scan is empty, has hardly a point, or both are the same.
+    """
     return _rigid_world("ego_registration", pair, register(pair.scan0.xyz, pair.scan1.xyz))
 
 
