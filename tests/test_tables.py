@@ -20,6 +20,7 @@ from training.cli import app  # noqa: E402
 from training.paper_figures import Picture  # noqa: E402
 from training.paper_scores import Compared, best_baselines, spread_over  # noqa: E402
 from training.paper_tables import PAPER  # noqa: E402
+from training.predictions import Prediction  # noqa: E402
 from training.tables import COMPARED, TablesOptions, tables  # noqa: E402
 
 OFF_M = 0.3
@@ -108,6 +109,27 @@ def test_rows_hold_what_evaluate_gives_and_where_they_belong(made):
     assert comparison == ["zero", "ego_true", "ego_registration", "late", "direct", "dense", "object"]
     assert all(row["run"] != "k0" for row in rows if row["table"] == 2)
     assert [row["pairs"] for row in rows_of(made, table=2, method="zero")] == [2, 4]
+
+
+def half_blind(pair, detections=None):
+    """The truth at every second point, 9 m off at the others, for which it says that it has no estimate."""
+    flow = pair.flow0.copy()
+    flow[1::2] += 9.0
+    return Prediction(pair.pair_id, {"half": flow}, np.arange(len(flow)) % 2 == 0, ego_motion=pair.ego_motion)
+
+
+def test_a_method_that_is_valid_in_places_is_scored_there_says_so_and_wins_nothing(
+    place, tmp_path, without_figures, capsys
+):
+    half = Compared("half", "Half", half_blind, valid_only=True)
+    found = tables(options(place, tmp_path), (*QUICK, half))
+    (row,) = (row for row in found.rows if row["method"] == "half" and row["eval_set"] == "K")
+    assert row["label"] == f"Half (valid {100 * row['coverage']:.0f} %)"
+    assert 0.4 < row["coverage"] < 0.6
+    assert row["bg_epe"] == pytest.approx(0.0, abs=1e-6)
+    assert row["all_points"]["bg_epe"] is not None
+    assert "half" not in best_baselines(found.rows)
+    assert row["label"].replace("%", r"\%") in (tmp_path / "tables.tex").read_text()
 
 
 def test_a_slow_method_is_scored_on_its_own_pairs_and_says_how_many(made):
