@@ -43,3 +43,16 @@ def cad_root() -> Path:
     if not (root / "manifest.json").is_file():
         pytest.skip(f"no car models at {root}: set AUGKITTI_TEST_CAD")
     return root
+
+
+@pytest.fixture
+def augkitti(monkeypatch, tmp_path):
+    """The command, in a folder and with a cache of the test's own."""
+    from typer.testing import CliRunner
+
+    from pipelines.cli import app
+
+    monkeypatch.setenv("AUGKITTI_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("AUGKITTI_KITTI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])

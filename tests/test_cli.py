@@ -7,13 +7,12 @@ import pytest
 import typer
 import yaml
 from tiny_drive import write_drive
-from typer.testing import CliRunner
 
 import pipelines.cache
 import pipelines.cli as cli
 from augkitti.config import Config, load_config
 from augkitti.dataset_index import read_index
-from pipelines.cli import DEFAULT_OUT, app
+from pipelines.cli import DEFAULT_OUT
 from pipelines.streets import Streets
 
 
@@ -22,14 +21,6 @@ def kitti(tmp_path_factory):
     root = tmp_path_factory.mktemp("kitti")
     write_drive(root, frames=(7, 8, 9))
     return root
-
-
-@pytest.fixture
-def augkitti(monkeypatch, tmp_path):
-    monkeypatch.setenv("AUGKITTI_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("AUGKITTI_KITTI", raising=False)
-    monkeypatch.chdir(tmp_path)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 GENERATE = [

@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
-from typer.testing import CliRunner
 from viewed_pair import MODEL, write_viewed_set
 
 from augkitti.errors import InputError
@@ -28,21 +27,12 @@ from augkitti.viewer.pages import STATIC, IndexRow, page_names, write_index_page
 from augkitti.viewer.pair_data import rigid_flow, thinned
 from augkitti.viewer.panes import beam_origins, through_panes
 from augkitti.viewer.thumbnail import SIZE, thumbnail
-from pipelines.cli import app
 
 
 @pytest.fixture(scope="module")
 def viewed(tmp_path_factory):
     root = tmp_path_factory.mktemp("viewed")
     return root, write_viewed_set(root / "aug", root / "kitti", pairs=3, tick_step=40)
-
-
-@pytest.fixture
-def augkitti(monkeypatch, tmp_path):
-    monkeypatch.setenv("AUGKITTI_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("AUGKITTI_KITTI", raising=False)
-    monkeypatch.chdir(tmp_path)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
 
 
 def assert_one_line(result, *words):
