@@ -247,9 +247,11 @@ def test_a_wheel_holds_every_file_that_the_product_needs(tmp_path):
 
 def test_make_check_is_what_ci_runs():
     (script,) = (ROOT / ".ci").iterdir()
-    assert re.findall(r"^make .*", script.read_text(), flags=re.MULTILINE) == ["make check"]
     makefile = (ROOT / "Makefile").read_text()
-    assert re.search(r"^check: lint types test ", makefile, flags=re.MULTILINE)
+    (parts,) = re.findall(r"^check: (.*?) ##", makefile, flags=re.MULTILINE)
+    run = re.findall(r"^make (.*)", script.read_text(), flags=re.MULTILINE)
+    assert run == parts.split()
+    assert "test" in run
     named = set(re.findall(r"`make (\w+)`", (ROOT / "CONTRIBUTING.md").read_text()))
     assert named <= set(re.findall(r"^(\w+):", makefile, flags=re.MULTILINE))
 
