@@ -44,7 +44,7 @@ _NEEDED = {
     *("never_returned_ticks", *_NUMBERS, *_PER_BEAM),
 }
 _OPTIONAL = {"period_s", "noise", "sensor", "spin", "fit"}  # the last three are notes, read by people
-_SEE = "see docs/scanners.md, and the shipped profile hdl32e.yaml, whose comments explain each key"
+_SEE = f"the comments in {Path(__file__).parent / 'profiles' / 'hdl32e.yaml'} explain each key"
 
 
 @dataclass(frozen=True, eq=False)

@@ -367,7 +367,7 @@ def export(
     out: Annotated[Path | None, typer.Option(parser=_place, metavar="DIR", help="Folder of the export.")] = None,
     split: Annotated[str | None, typer.Option(help="train, validation or test. Without: all pairs.")] = None,
 ) -> None:
-    """Write the data set in a form that other programs read; an interrupted export goes on. See docs/exports.md."""
+    """Write the data set in a form that other programs read; an interrupted export goes on."""
     with _answers("; finished pairs are kept, the same command goes on"):
         from pipelines.export import export_set
 

@@ -55,4 +55,4 @@ def _make(dataset: Dataset, export: Export) -> None:
     found = f", {len(export.done):,} found" if export.done else ""
     rate = f", {made / seconds:,.1f} pairs/s" if made else ""
     note(f"{export.out}: {made:,} pairs made{found}, {size / 1e6:,.1f} MB, {seconds:,.1f} s{rate}")
-    note(f"for {export.form.reader}; how to read it: docs/exports.md")
+    note(f"for {export.form.reader}")

@@ -76,7 +76,9 @@ def run_tasks(
             if type(err).__name__ != "KilledWorker":  # Dask's: several workers died one after another under one task
                 raise
             problem = "workers kept dying under one task, as happens when memory runs out or time is up"
-            raise MachineError(str(scheduler), problem, "see docs/scale.md, then go on with --resume") from err
+            raise MachineError(
+                str(scheduler), problem, "give workers more memory or time, then go on with --resume"
+            ) from err
 
 
 def _on_workers(client: Any) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scored_pair import an_object, make_pair
 
-from augkitti.frames import box_pose, compose, pose_from_xyz_yaw, transform_points
+from augkitti.frames import box_pose, compose, invert, pose_from_xyz_yaw, transform_points
 
 EGO = pose_from_xyz_yaw(-0.9, 0.05, 0.0, 0.02)
 OWN = pose_from_xyz_yaw(1.3, -0.4, 0.0, 0.06)  # of the box over ground, about its centre
@@ -47,6 +47,18 @@ def corner_and_box(seed=0, spacing=0.4, ego=EGO, own=OWN):
     xyz1 = np.concatenate([transform_points(ego, world), transform_points(motion, car)]).astype(np.float32)
     item = replace(an_object(0, 0), box0=BOX, motion=motion)
     return _pair(xyz0, xyz1, np.repeat([-1, 0], [len(world), len(car)]), (item,), ego), motion
+
+
+def along_the_axes(x, y):
+    """Own motion of the box that shifts it along the scanner's axes."""
+    shift = pose_from_xyz_yaw(x, y, 0.0, 0.0)
+    return compose(invert(box_pose(BOX)), compose(shift, box_pose(BOX)))
+
+
+def with_noise(pair, sigma_m):
+    """The pair with normal noise on scan 1."""
+    noise = np.random.default_rng(1).normal(0.0, sigma_m, pair.scan1.xyz.shape)
+    return replace(pair, scan1=replace(pair.scan1, xyz=pair.scan1.xyz + noise.astype(np.float32)))
 
 
 def _pair(xyz0, xyz1, instance, objects, ego):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matched_scene import EGO as CORNER_EGO
+from matched_scene import corner_and_box
 from scored_pair import EGO, an_object
 from street_of_boxes import street_pair
 
-from augkitti.frames import rigid, transform_points
+from augkitti.frames import pose_from_xyz_yaw, rigid, transform_points
 from training.baselines.clusters import clusters, ego_icp_clusters
 from training.baselines.followed import sure, true_boxes
 from training.baselines.icp import icp, icp_strong
@@ -54,6 +56,30 @@ def test_plain_icp_recovers_a_small_motion_exactly():
     assert centre_error(said.motions[0], pair.objects[0]) < 1e-3
 
 
+def test_plain_icp_stays_within_the_noise_where_little_moves():
+    pair = street_pair([an_object(12, 3, step=1.0)], noise_m=0.02, points=600)
+    said = icp(pair, true_boxes(pair))
+    assert translation_error(said.ego_motion, EGO) < 0.1
+    assert centre_error(said.motions[0], pair.objects[0]) < 0.1
+    assert rotation_error(said.motions[0], pair.objects[0].motion) < 0.03
+
+
+def test_careful_icp_recovers_the_motions_of_a_corner_and_a_box():
+    pair, motion = corner_and_box()
+    said = icp_strong(pair, true_boxes(pair))
+    assert translation_error(said.ego_motion, CORNER_EGO) < 0.03
+    assert rotation_error(said.ego_motion, CORNER_EGO) < 0.003
+    np.testing.assert_allclose(said.motions[0], motion, atol=1e-3)
+
+
+def test_plain_icp_recovers_small_motions_of_a_corner_and_a_box_exactly():
+    ego, own = pose_from_xyz_yaw(-0.05, 0.02, 0.0, 0.004), pose_from_xyz_yaw(0.06, 0.03, 0.0, 0.01)
+    pair, motion = corner_and_box(ego=ego, own=own)
+    said = icp(pair, true_boxes(pair))
+    np.testing.assert_allclose(said.ego_motion, ego, atol=1e-4)
+    np.testing.assert_allclose(said.motions[0], motion, atol=1e-3)
+
+
 def test_plain_icp_is_lost_after_a_large_motion_where_careful_icp_is_not(driving):
     worst = []
     for method in FOLLOWING:
@@ -70,6 +96,15 @@ def test_clusters_need_no_detections(driving):
     for row in range(3):
         assert np.median(off[driving.scan0.instance == row]) < 0.02
     assert off[driving.scan0.instance < 0].max() < 0.05
+
+
+def test_clusters_stay_within_the_noise():
+    pair = street_pair([an_object(12, 3, step=1.5, turn=0.03), an_object(20, -4, step=-1.0)], noise_m=0.02, points=600)
+    said = ego_icp_clusters(pair)
+    off = np.linalg.norm(said.flows["clusters"] - pair.flow0, axis=1)
+    for row in range(2):
+        assert np.median(off[pair.scan0.instance == row]) < 0.08
+    assert np.median(off[pair.scan0.instance < 0]) < 0.03
 
 
 def test_what_stands_together_is_one_cluster(driving):

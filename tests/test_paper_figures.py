@@ -1,6 +1,6 @@
 """Figures of the paper: the diagram tells the truth about its network, pictures are made from what was scored."""
 
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +15,16 @@ from test_tables import QUICK, options  # noqa: E402
 from tiny_network import tiny_settings  # noqa: E402
 
 import training.paper_figures as module  # noqa: E402
-from training.augmentation_figures import plain_pair  # noqa: E402
+from augkitti.scan_pair import GLASS, THROUGH_GLASS  # noqa: E402
+from training import augmentation_figures  # noqa: E402
+from training.augmentation_figures import (  # noqa: E402
+    SOMEHOW,
+    WELL,
+    draw_windows,
+    draw_workflow,
+    find_example,
+    plain_pair,
+)
 from training.network import PointFlowNet  # noqa: E402
 from training.network_figure import draw_network, network_stages  # noqa: E402
 from training.paper_scores import _close_cars  # noqa: E402
@@ -53,6 +62,43 @@ def test_the_source_of_a_pair_is_its_measured_points():
     assert {label.id for label in source.labels0} == {
         i.id for i in pair.objects if i.origin == "labelled" and i.box0 is not None
     }
+
+
+def test_windows_and_workflow_are_drawn_from_a_car_that_is_seen_well(tmp_path):
+    example = find_example([make_pair(tick_step=1).pair])  # a road between walls, as densely scanned as a street
+    surfaces = [
+        set(pair.scan0.surface[pair.scan0.instance == example.car].tolist())
+        for pair in (example.augmented, example.opaque)
+    ]
+    assert THROUGH_GLASS in surfaces[0]
+    assert THROUGH_GLASS not in surfaces[1]
+    assert GLASS in surfaces[1]  # where panes are, though they let nothing through
+    np.testing.assert_array_equal(
+        example.augmented.objects[example.car].pose0, example.opaque.objects[example.car].pose0
+    )
+    for draw in (draw_windows, draw_workflow):
+        path = tmp_path / f"{draw.__name__}.png"
+        draw(example, path)
+        with Image.open(path) as picture:
+            assert min(picture.size) > 700
+            assert len(picture.convert("RGB").getcolors(1 << 24)) > 200
+
+
+def test_the_first_car_seen_well_is_shown_and_else_the_first_seen_at_all(monkeypatch):
+    seen = {"far": SOMEHOW, "none": None, "near": WELL, "later": WELL}
+
+    def tried(pair, take_any):
+        demand = seen[pair]
+        example = SimpleNamespace(augmented=pair, car=0)
+        return example if demand is WELL or (demand is SOMEHOW and take_any) else None
+
+    monkeypatch.setattr(augmentation_figures, "_example_in", tried)
+    monkeypatch.setattr(augmentation_figures, "_is_seen", lambda pair, car, demand: seen[pair] is demand)
+    for pairs, shown in ((["none", "far", "near", "later"], "near"), (["none", "far", "none"], "far")):
+        left = iter(pairs)
+        assert find_example(left).augmented == shown
+        assert list(left) == (["later"] if shown == "near" else [])
+    assert find_example(["none"]) is None
 
 
 def test_close_cars_are_shown_with_their_error(tmp_path):

@@ -13,12 +13,14 @@ torch = pytest.importorskip("torch")
 from scored_pair import SETTINGS, a_data_set, a_run  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
+from augkitti.errors import InputError  # noqa: E402
 from augkitti.frames import compose, pose_from_xyz_yaw  # noqa: E402
 from training import tables as module  # noqa: E402
 from training.baselines.followed import boxes_of, followed  # noqa: E402
+from training.checkpoint import shipped_checkpoint  # noqa: E402
 from training.cli import app  # noqa: E402
 from training.paper_figures import Picture  # noqa: E402
-from training.paper_scores import Compared, best_baselines, spread_over  # noqa: E402
+from training.paper_scores import Compared, best_baselines, run_names, spread_over  # noqa: E402
 from training.paper_tables import PAPER  # noqa: E402
 from training.predictions import Prediction  # noqa: E402
 from training.tables import COMPARED, TablesOptions, tables  # noqa: E402
@@ -269,3 +271,21 @@ def test_pairs_are_spread_over_a_set():
     assert spread_over(10, 3) == [0, 3, 6]
     assert spread_over(2, 30) == [0, 1]
     assert spread_over(7, 7) == list(range(7))
+
+
+def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    paths = [tmp_path / "k" / "a", tmp_path / "both" / "a", tmp_path / "b" / "checkpoint.pt", tmp_path / "k.pt"]
+    assert run_names(paths) == ["k/a", "both/a", "b", "k"]
+    assert run_names([shipped_checkpoint(), tmp_path / "small.pt"]) == ["shipped", "small"]
+    with pytest.raises(InputError, match="is given twice"):
+        run_names([tmp_path / "a", tmp_path / "x" / ".." / "a"])
+
+
+def test_the_page_says_how_object_flow_fares_beside_direct_flow(made):
+    text = (made[0] / "index.html").read_text()
+    said = re.search(
+        r"Here, on K\+AK, a car&#x27;s flow from its one motion is off by ([\d.]+) m .*? by ([\d.]+) m", text
+    )
+    ours = {way: rows_of(made, table=2, eval_set="K+AK", method=way) for way in ("object", "direct")}
+    means = [f"{np.mean([row['fg_epe'] for row in ours[way]]):.2f}" for way in ("object", "direct")]
+    assert list(said.groups()) == means

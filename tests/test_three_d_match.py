@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matched_scene import BOX, EGO, corner_and_box
+from matched_scene import BOX, EGO, along_the_axes, corner_and_box, with_noise
 from pair_factory import make_pair as cast_pair
 
 from augkitti.errors import InputError
+from augkitti.frames import pose_from_xyz_yaw
 from training.baselines.followed import true_boxes
 from training.metrics import rotation_error, translation_error
 
@@ -29,6 +30,7 @@ from training.baselines.three_d_match import (  # noqa: E402
     CONFIG,
     keypoints,
     scene_of,
+    three_d_match,
     three_d_match_strong,
 )
 
@@ -97,6 +99,24 @@ def test_motions_of_a_corner_and_a_box_are_found_to_a_fraction_of_a_voxel():
     assert rotation_error(said.ego_motion, EGO) < 0.01
     assert translation_error(said.motions[0], motion, BOX[:3]) < 0.2
     assert rotation_error(said.motions[0], motion) < 0.08
+
+
+@pytest.mark.parametrize("method", [three_d_match, three_d_match_strong])
+def test_noise_moves_the_answer_no_more_than_itself(method):
+    pair, motion = corner_and_box(spacing=0.4)
+    said = method(with_noise(pair, 0.02), true_boxes(pair))
+    assert translation_error(said.ego_motion, EGO) < 0.05
+    assert rotation_error(said.ego_motion, EGO) < 0.005
+    assert translation_error(said.motions[0], motion, BOX[:3]) < 0.1
+    assert rotation_error(said.motions[0], motion) < 0.07
+
+
+def test_shifts_by_whole_voxels_are_found_exactly_without_care():
+    ego = pose_from_xyz_yaw(-0.6, 0.6, 0.0, 0.0)
+    pair, motion = corner_and_box(ego=ego, own=along_the_axes(1.2, 0.0))
+    said = three_d_match(pair, true_boxes(pair))
+    np.testing.assert_allclose(said.motions[0], motion, atol=1e-5)
+    assert translation_error(said.ego_motion, ego) < 0.005  # look-alikes within reach of RANSAC's inliers
 
 
 def test_a_scan_has_its_thousand_keypoints():

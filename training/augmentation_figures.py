@@ -4,7 +4,7 @@ The pair is made again from its measured points, so that every step can be shown
 they hide, how they move.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ from augkitti.scan_pair import (
     ScanPair,
 )
 from augkitti.scanner import load_profile
-from training.pictures import flow_colours
+from training.pictures import draw_wheel, flow_colours
 
 _SEEDS = 40  # tries for a pair in which a car stands where it can be seen well
 _VIEW_M = (-6.0, 44.0, -15.0, 15.0)  # of the workflow: x from, to, y from, to
@@ -100,42 +100,69 @@ WELL = Demand((6.0, 16.0), 0.5, 20)  # panes and seats are told apart
 SOMEHOW = Demand((4.0, 30.0), 0.0, 3)
 
 
-def find_example(pair: AugmentedPair, demand: Demand = WELL) -> Example | None:
-    """Cars put into a plain pair, one of them seen as demanded; None where none finds room there.
+def find_example(pairs: Iterable[AugmentedPair]) -> Example | None:
+    """Cars put into the first plain pair that lets one be seen `WELL`; else `SOMEHOW`; None where none finds room.
 
     With opaque panes the same seed gives the same cars in the same places, unless one is then refused: such seeds are
     passed over.
     """
+    second_best = None
+    for pair in pairs:
+        example = _example_in(pair, second_best is None)
+        if example is not None and _is_seen(example.augmented, example.car, WELL):
+            return example
+        second_best = second_best or example
+    return second_best
+
+
+def _example_in(pair: AugmentedPair, take_any: bool) -> Example | None:
+    """One whose car is seen well; the first whose car is seen somehow, if no seed gives such and `take_any`."""
     profile, source = load_profile(), plain_pair(pair)
     clear, steel = Config(cars=(2, 3)), Config(cars=(2, 3), glass="opaque")
     scan0, scan1 = (prepare_scan(scan, profile, clear) for scan in (source.scan0, source.scan1))
     prepared = prepare_pair(source, scan0, scan1, clear)
     models = [model for model in parametric_cars() if model.category == "Car"]
+    second_best = None
     for seed in range(_SEEDS):
         made = augment_pair(source, models, profile, clear, seed, pair.pair_id, prepared)
-        row = None if made is None else _car_to_show(made, demand)
+        row = None if made is None else _car_to_show(made)
         if made is None or row is None:
+            continue
+        well = _is_seen(made, row, WELL)
+        if not well and (second_best is not None or not take_any):
             continue
         opaque = augment_pair(source, models, profile, steel, seed, pair.pair_id, prepared)
         if opaque is not None and _stands_alike(made, opaque, row):
-            return Example(source, prepared, made, opaque, row)
+            example = Example(source, prepared, made, opaque, row)
+            if well:
+                return example
+            second_best = example
+    return second_best
+
+
+def _car_to_show(pair: AugmentedPair) -> int | None:
+    """The virtual car to show: one that is seen well before one that is seen somehow, then most points inside."""
+    for demand in (WELL, SOMEHOW):
+        seen = {row: _points_inside(pair, row) for row in range(len(pair.objects)) if _is_seen(pair, row, demand)}
+        if seen:
+            return max(seen, key=seen.__getitem__)
     return None
 
 
-def _car_to_show(pair: AugmentedPair, demand: Demand) -> int | None:
-    """The virtual car ahead that moves, is seen as demanded, and has most points through its panes."""
-    seen = {}
-    for row, item in enumerate(pair.objects):
-        if item.origin != "virtual" or item.pose0 is None or abs(item.speed or 0.0) < 2.0 or item.pose0[0, 3] < 0.0:
-            continue
-        scanner = transform_points(invert(item.pose0), np.zeros(3))
-        distance = float(np.hypot(scanner[0], scanner[1]))
-        low, high = demand.distance_m
-        if low < distance < high and abs(scanner[1]) >= demand.from_the_side * distance:
-            inside = (pair.scan0.instance == row) & (pair.scan0.surface == THROUGH_GLASS)
-            seen[row] = int(inside.sum())
-    best = max(seen, key=seen.__getitem__, default=None)
-    return best if best is not None and seen[best] >= demand.inside else None
+def _is_seen(pair: AugmentedPair, row: int, demand: Demand) -> bool:
+    """Whether an object is a virtual car ahead that moves, and is seen as demanded."""
+    item = pair.objects[row]
+    if item.origin != "virtual" or item.pose0 is None or abs(item.speed or 0.0) < 2.0 or item.pose0[0, 3] < 0.0:
+        return False
+    scanner = transform_points(invert(item.pose0), np.zeros(3))
+    distance = float(np.hypot(scanner[0], scanner[1]))
+    low, high = demand.distance_m
+    aside = abs(scanner[1]) >= demand.from_the_side * distance
+    return bool(low < distance < high and aside and _points_inside(pair, row) >= demand.inside)
+
+
+def _points_inside(pair: AugmentedPair, row: int) -> int:
+    return int(((pair.scan0.instance == row) & (pair.scan0.surface == THROUGH_GLASS)).sum())
 
 
 def _stands_alike(a: AugmentedPair, b: AugmentedPair, row: int) -> bool:
@@ -274,6 +301,7 @@ def draw_workflow(example: Example, path: Path) -> None:
             xyz[:, 0], xyz[:, 1], s=np.where(np.linalg.norm(over_ground, axis=1) > 0.05, 3.0, 0.6),
             c=flow_colours(over_ground[:, :2]), linewidths=0,
         )  # fmt: skip
+        draw_wheel(panels[5], "over ground", ahead_is_up=False)
 
 
 def _dots(axes: Any, xyz: Array, colour: str, size: float = 0.6) -> None:

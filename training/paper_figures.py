@@ -14,19 +14,20 @@ import numpy as np
 from augkitti.draw import figure_to
 from augkitti.frames import Array, transform_points
 from augkitti.scan_pair import AugmentedPair, Bool
-from training.augmentation_figures import SOMEHOW, WELL, draw_windows, draw_workflow, find_example
+from training.augmentation_figures import draw_windows, draw_workflow, find_example
 from training.baselines import rigid_flow
 from training.equivariance import draw_chart, run_experiment
 from training.network import PointFlowNet
 from training.network_figure import draw_network
-from training.paper_scores import MIXED, Again, PaperSets, Results, best_baselines
+from training.paper_scores import MIXED, Again, PaperSets, Results, best_baselines, spread_over
 from training.paper_tables import BASELINE, NETWORK, OURS, REFERENCE, lines_of
-from training.pictures import _BOX_COLOUR, _TRUE_COLOUR, _draw_boxes, _draw_wheel, flow_colours
+from training.pictures import BOX_COLOUR, TRUE_COLOUR, draw_boxes, draw_wheel, flow_colours
 from training.predictions import Prediction
 from training.score import Rules, truth_of
 
 SCENES = (0.25, 0.5, 0.75)  # of the pairs, by our foreground error: the comparison shows neither the best nor the worst
 FAILURES = 3
+_PLACES = 8  # pairs tried for a good place of a car
 _FEWEST_POINTS = 15  # of close cars, for a failure that can be seen
 _MOST_DRAWN, _ARROWS = 20_000, 450
 _AHEAD_M, _ASIDE_M = 48.0, 20.0  # of a scene, at most
@@ -91,11 +92,9 @@ def _network(folder: Path, network: PointFlowNet) -> Picture:
 
 
 def _augmentation(folder: Path, sets: PaperSets) -> list[Picture]:
-    """Windows and workflow, from the first pair of K's test split in which a car finds a good place, or any at all."""
+    """Windows and workflow, from a pair of K's test split in which a car finds a good place."""
     plain = sets.plain()
-    places = range(0, len(plain), max(len(plain) // 12, 1))
-    tried = (find_example(plain[place], demand) for demand in (WELL, SOMEHOW) for place in places)
-    example = next((one for one in tried if one is not None), None)
+    example = find_example(plain[place] for place in spread_over(len(plain), _PLACES))
     if example is None:
         print("no pair of K has room for a virtual car: no pictures of the augmentation")
         return []
@@ -147,8 +146,8 @@ def _zoom(folder: Path, again: Again, ranked: Sequence[str], rivals: Sequence[st
     with figure_to(path, (5.6 * (1 + len(panels)), 6.2)) as figure:
         figure.subplots_adjust(left=0.03, right=0.99, top=0.9, bottom=0.09, wspace=0.12)
         first = _scene(figure, 1, 1 + len(panels), 1, pair, pair.flow0, whole, "scan 0; colour: true flow over ground")
-        _draw_boxes(first, _true_boxes(pair), _TRUE_COLOUR)
-        _draw_wheel(first, "over ground")
+        draw_boxes(first, _true_boxes(pair), TRUE_COLOUR)
+        draw_wheel(first, "over ground")
         first.add_patch(_rectangle(limits))
         for k, (title, flow, prediction) in enumerate(panels, start=2):
             axes = _scene(figure, 1, 1 + len(panels), k, pair, flow, limits, title, size=8.0, arrows=140)
@@ -177,7 +176,7 @@ def _comparison(folder: Path, number: int, name: str, again: Again, rivals: Sequ
             axes = _scene(figure, 2, 2, k, pair, flow, limits, title)
             _boxes_of(axes, pair, prediction, again.rules)
             if k == 1:
-                _draw_wheel(axes, "over ground")
+                draw_wheel(axes, "over ground")
         figure.suptitle(name, x=0.05, ha="left", fontsize=11)
     return Picture(
         path,
@@ -204,6 +203,8 @@ def _failure(folder: Path, number: int, name: str, again: Again) -> Picture:
         for k, (title, flow, prediction) in enumerate([("truth", pair.flow0, None), *_panels(pair, said, again)], 1):
             axes = _scene(figure, 1, 2, k, pair, flow, limits, title, size=8.0, arrows=140)
             _boxes_of(axes, pair, prediction, again.rules)
+            if k == 1:
+                draw_wheel(axes, "over ground")
         figure.suptitle(
             f"{name}: flow off by {error[here].mean():.2f} m on the {here.sum()} points of close cars", x=0.06,
             ha="left", fontsize=11,
@@ -284,11 +285,11 @@ def _scene(
 
 def _boxes_of(axes: Any, pair: AugmentedPair, said: Prediction | None, rules: Rules) -> None:
     """True boxes, and those that a method follows."""
-    _draw_boxes(axes, _true_boxes(pair), _TRUE_COLOUR)
+    draw_boxes(axes, _true_boxes(pair), TRUE_COLOUR)
     if said is not None and said.boxes is not None and said.scores is not None:
         sure = said.scores >= rules.score
         motions = None if said.motions is None else said.motions[sure]
-        _draw_boxes(axes, said.boxes[sure], _BOX_COLOUR, motions, said.scores[sure])
+        draw_boxes(axes, said.boxes[sure], BOX_COLOUR, motions, said.scores[sure])
 
 
 def _car_to_show(pair: AugmentedPair, rules: Rules) -> Array:

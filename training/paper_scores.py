@@ -133,14 +133,14 @@ def load_runs(k_runs: Sequence[Path], k_ak_runs: Sequence[Path], team: Team) -> 
     """All networks, those trained on K first.
 
     Raises:
-        InputError: no such run; or they see different parts of the world, so that no figures would compare.
+        InputError: no such run, or one twice; or they see different parts of the world, so that no figures would
+            compare.
     """
-    named: list[tuple[str, Path, str]] = [("K", path, _name(path)) for path in k_runs]
-    named += [(MIXED, path, _name(path)) for path in k_ak_runs] or [(MIXED, shipped_checkpoint(), "shipped")]
-    names = [name for _, _, name in named]
+    on_k, on_both = [*k_runs], [*k_ak_runs] or [shipped_checkpoint()]
+    paths = on_k + on_both
     out: list[TrainedRun] = []
-    for trained_on, path, name in named:
-        name = name if names.count(name) == 1 else str(path)
+    for path, name in zip(paths, run_names(paths), strict=True):
+        trained_on = "K" if len(out) < len(on_k) else MIXED
         checkpoint = load_checkpoint(path)
         predictor = Predictor(network_of(checkpoint, path), checkpoint.settings, team)
         if out and Rules.of(checkpoint.settings) != Rules.of(out[0].predictor.settings):
@@ -296,7 +296,28 @@ def _close_cars(pair: AugmentedPair, ours: Prediction, rules: Rules) -> list[Clo
     return [CloseCars(pair.pair_id, float(error.mean()), int(on_close.sum()))]
 
 
-def _name(path: Path) -> str:
-    """Of a run; two folders above a file that only says `checkpoint.pt` is no name."""
-    place = path.resolve()
-    return place.parent.name if place.name == "checkpoint.pt" else place.stem if place.suffix == ".pt" else place.name
+def run_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each run: the last folders of its path, as many as tell it from the others.
+
+    Raises:
+        InputError: a run is given twice.
+    """
+    shipped = shipped_checkpoint().resolve()
+    places = [path.resolve() for path in paths]
+    for path, place in zip(paths, places, strict=True):
+        if places.count(place) > 1:
+            raise InputError(path, "is given twice as a run", "give runs trained apart: on K, and on K and AK")
+    parts = [_parts(place) if place != shipped else ("shipped",) for place in places]
+    names = [mine[-1:] for mine in parts]
+    while len(set(names)) < len(names) and any(len(name) < len(mine) for name, mine in zip(names, parts, strict=True)):
+        names = [
+            mine[-len(name) - 1 :] if names.count(name) > 1 else name for name, mine in zip(names, parts, strict=True)
+        ]
+    return ["/".join(name) for name in names]
+
+
+def _parts(place: Path) -> tuple[str, ...]:
+    """Of a run's path; two folders above a file that only says `checkpoint.pt` are no name of its own."""
+    if place.name == "checkpoint.pt":
+        return place.parent.parts[1:]
+    return (place.with_suffix("") if place.suffix == ".pt" else place).parts[1:]

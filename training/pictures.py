@@ -12,7 +12,7 @@ from augkitti.scan_pair import Bool
 
 _MOST_POINTS = 40_000  # more only fill the picture
 _ARROWS = 900
-_EGO_COLOUR, _BOX_COLOUR, _TRUE_COLOUR = "#333333", "#D55E00", "#0072B2"
+_EGO_COLOUR, BOX_COLOUR, TRUE_COLOUR = "#333333", "#D55E00", "#0072B2"
 
 
 def draw_flow(
@@ -83,10 +83,10 @@ def draw_flow(
                 angles="xy", scale_units="xy", scale=1.0, width=0.0012, color=_EGO_COLOUR, alpha=0.55,
             )  # fmt: skip
             if flow is panels[-1][1]:
-                _draw_boxes(axes, boxes, _BOX_COLOUR, motions, scores)
+                draw_boxes(axes, boxes, BOX_COLOUR, motions, scores)
             else:
-                _draw_boxes(axes, true_boxes, _TRUE_COLOUR)
-            _draw_wheel(axes, "over ground" if ego_motion is not None else "as seen")
+                draw_boxes(axes, true_boxes, TRUE_COLOUR)
+            draw_wheel(axes, "over ground" if ego_motion is not None else "as seen")
         if truth is not None:
             axes = _axes(figure, count, count, limits_m, "error of the predicted flow: grey 0, red 0.5 m and more")
             error = np.linalg.norm(flow0[chosen] - truth[chosen], axis=1)
@@ -95,8 +95,8 @@ def draw_flow(
             colours = np.where(marked[:, None], (1 - shade) * [0.85, 0.85, 0.85] + shade * [0.8, 0.0, 0.0], 0.95)
             order = np.argsort(error * marked)
             axes.scatter(-points[order, 1], points[order, 0], s=1.2, c=colours[order], linewidths=0)
-            _draw_boxes(axes, true_boxes, _TRUE_COLOUR)
-            _draw_boxes(axes, boxes, _BOX_COLOUR)
+            draw_boxes(axes, true_boxes, TRUE_COLOUR)
+            draw_boxes(axes, boxes, BOX_COLOUR)
         figure.suptitle(title, x=0.02 / count, ha="left", fontsize=12)
 
 
@@ -124,14 +124,18 @@ def _axes(figure: Any, count: int, number: int, limits_m: tuple[float, float, fl
     return axes
 
 
-def _draw_wheel(axes: Any, what: str) -> None:
-    """Which colour is which flow, in a corner where no street is: directions as in the picture, rim 1 m."""
+def draw_wheel(axes: Any, what: str, ahead_is_up: bool = True) -> None:
+    """Which colour is which flow, in a corner where no street is: directions as in the picture, rim 1 m.
+
+    A picture has x up and y to the left, or x to the right and y up.
+    """
     inset = axes.inset_axes((0.01, 0.01, 0.11, 0.11))
     side = np.linspace(-1.0, 1.0, 81)
-    right, ahead = (grid.ravel() for grid in np.meshgrid(side, side))
-    disc = np.hypot(right, ahead) <= 1.0
-    colours = flow_colours(np.stack([ahead, -right], axis=1)[disc], 1.0)
-    inset.scatter(right[disc], ahead[disc], s=1.5, c=colours, linewidths=0)
+    right, up = (grid.ravel() for grid in np.meshgrid(side, side))
+    disc = np.hypot(right, up) <= 1.0
+    xy = np.stack([up, -right] if ahead_is_up else [right, up], axis=1)
+    colours = flow_colours(xy[disc], 1.0)
+    inset.scatter(right[disc], up[disc], s=1.5, c=colours, linewidths=0)
     inset.set_aspect("equal")
     inset.axis("off")
     axes.annotate(
@@ -140,13 +144,14 @@ def _draw_wheel(axes: Any, what: str) -> None:
     )  # fmt: skip
 
 
-def _draw_boxes(
+def draw_boxes(
     axes: Any,
     boxes: Array | None,
     colour: str,
     motions: Array | None = None,
     scores: Sequence[float] | Array | None = None,
 ) -> None:
+    """Outlines of boxes (n, 7) from above with the heading; where each goes by its motion (4, 4), and its score."""
     for row, box in enumerate(boxes if boxes is not None else ()):
         corners = footprint_corners(box)
         loop = np.concatenate([corners, corners[:1], (corners[:1] + corners[3:]) / 2, np.asarray(box)[None, :2]])

@@ -39,10 +39,9 @@ def support_of(points: F64, keypoints: F64, radius_m: float) -> Support:
     if not len(points) or not len(keypoints):
         nothing = np.zeros(0, dtype=np.int64)
         return Support(nothing, nothing, np.zeros((0, 3)), np.zeros(0), np.zeros(len(keypoints), np.int64), radius_m)
-    found = cKDTree(points).query_ball_point(keypoints, radius_m)
-    count = np.fromiter(map(len, found), np.int64, len(keypoints))
-    keypoint = np.repeat(np.arange(len(keypoints)), count)
-    point = np.fromiter((row for rows in found for row in rows), np.int64, int(count.sum()))
+    near = cKDTree(keypoints).sparse_distance_matrix(cKDTree(points), radius_m, output_type="ndarray")
+    order = np.lexsort((near["j"], near["i"]))
+    keypoint, point = near["i"][order].astype(np.int64), near["j"][order].astype(np.int64)
     away = points[point] - keypoints[keypoint]
     distance = np.sqrt(np.einsum("pa,pa->p", away, away))
     kept = distance > 1e-9
