@@ -65,7 +65,24 @@ class _Candidate:
 def load_cad_folder(
     folder: Path, categories: tuple[str, ...] | None = None, cache_dir: Path | None = None
 ) -> CadLibrary:
-    """Load every vehicle of a folder; a bad one among good ones is left out and listed with the reason.
+    """As `check_cad_folder`, where there is a usable model to go on with.
+
+    Raises:
+        InputError: as there, or not one usable model.
+    """
+    library = check_cad_folder(folder, categories, cache_dir)
+    if not library.models:
+        asked = "" if categories is None else f" of category {' or '.join(categories)}"
+        reasons = "; ".join(f"{row.name}: {row.problem}" for row in library.report[:3])
+        problem = f"no usable car model{asked} ({reasons})"
+        raise InputError(folder, problem, f"see `augkitti cad check {folder}` for every file")
+    return library
+
+
+def check_cad_folder(
+    folder: Path, categories: tuple[str, ...] | None = None, cache_dir: Path | None = None
+) -> CadLibrary:
+    """Load every vehicle of a folder; a bad one is left out and listed with the reason.
 
     Each subfolder is one vehicle or several files; loose files are vehicles of their own.
 
@@ -75,7 +92,7 @@ def load_cad_folder(
         cache_dir: where finished models are kept between runs; None for no cache.
 
     Raises:
-        InputError: no such folder, a damaged manifest, or not one usable model.
+        InputError: no such folder, a damaged manifest, or no file that could be a model.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -98,12 +115,8 @@ def load_cad_folder(
         else:
             models.append(model)
         report.append(_decision_of(model, relative, decisions, problem))
-    if not models:
-        asked = "" if categories is None else f" of category {' or '.join(categories)}"
-        reasons = (
-            "; ".join(f"{r.name}: {r.problem}" for r in report[:3]) or f"no file ends in {', '.join(MODEL_SUFFIXES)}"
-        )
-        raise InputError(folder, f"no usable car model{asked} ({reasons})", "see `augkitti cad check` for every file")
+    if not report:
+        raise InputError(folder, "no car model", f"give files that end in {', '.join(MODEL_SUFFIXES)}")
     return CadLibrary(
         tuple(sorted(models, key=lambda m: m.name)), tuple(sorted(report, key=lambda r: (r.name, r.file)))
     )

@@ -140,6 +140,11 @@ def trace() -> None:
         traceback.print_exc()
 
 
+def signed(title: str) -> str:
+    """A title with the version of the program whose table it stands over."""
+    return f"{title} (augkitti {augkitti.__version__})"
+
+
 def as_json(content: Mapping[str, Any]) -> str:
     """Indented JSON text with the program's version first; null for what is no number."""
     return json.dumps(_finite({"program_version": augkitti.__version__, **content}), indent=1, allow_nan=False) + "\n"

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from augkitti.command_line import signed
 from augkitti.dataset import Dataset
 from augkitti.draw import CAR_COLOURS, SURFACE_COLOURS, figure_to
 from augkitti.frames import F64, compose, invert, se3_exp, se3_log, yaw_of
@@ -229,7 +230,7 @@ def info_tables(info: Info) -> list["RenderableType"]:
     """Tables for a terminal."""
     from rich.table import Table
 
-    totals = Table(title="totals", title_justify="left", show_header=False)
+    totals = Table(title=signed("totals"), title_justify="left", show_header=False)
     for name, value in (
         ("pairs", f"{info.pairs:,}"),
         ("points", f"{info.points:,}"),

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from augkitti.command_line import is_json, print_json
+from augkitti.command_line import is_json, print_json, signed
 from augkitti.dataset_index import replace_whole
 from augkitti.errors import InputError, MachineError
 
@@ -238,7 +238,7 @@ def show_cache() -> None:
         content = {kind: {"entries": len(sizes), "bytes": sum(sizes)} for kind, sizes in kinds.items()}
         print_json({"folder": str(folder), "most_bytes": bound, "kinds": content})
         return
-    print(f"{folder}: {sum(entry.bytes for entry in there) / 1e9:,.2f} of at most {bound / 1e9:,.1f} GB")
+    print(signed(f"{folder}: {sum(entry.bytes for entry in there) / 1e9:,.2f} of at most {bound / 1e9:,.1f} GB"))
     for kind in _PATTERNS:
         sizes = [entry.bytes for entry in there if entry.kind == kind]
         print(f"  {kind}: {len(sizes):,}, {sum(sizes) / 1e9:,.2f} GB")

@@ -47,6 +47,7 @@ def _place(text: str) -> Path:
 
 
 DEFAULT_OUT = Path("augkitti-data")
+EXPORTS = ("opensceneflow", "av2", "semantickitti", "kitti-object", "hplflownet")  # `augkitti.export` is slow to import
 
 Kitti = Annotated[
     Path | None,
@@ -362,7 +363,7 @@ def export(
     folder: Folder = DEFAULT_OUT,
     form: Annotated[
         str,
-        typer.Option("--format", metavar="F", help="opensceneflow, av2, semantickitti, kitti-object, hplflownet."),
+        typer.Option("--format", metavar="F", help=f"{', '.join(EXPORTS)}.", autocompletion=lambda: list(EXPORTS)),
     ] = "",
     out: Annotated[Path | None, typer.Option(parser=_place, metavar="DIR", help="Folder of the export.")] = None,
     split: Annotated[str | None, typer.Option(help="train, validation or test. Without: all pairs.")] = None,

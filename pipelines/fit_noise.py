@@ -631,7 +631,8 @@ def _edge_shares(edges: JudgedEdges) -> F64:
 def vehicle_edges(root: KittiRoot, scanner: ScannerProfile) -> F64 | None:
     """Chances (2,) of a mixed point and of nothing where a labelled vehicle stands before something; None if few."""
     found = []
-    for _, its in itertools.groupby(vehicle_views(root, scanner), key=lambda view: (view.sequence, view.frame)):
+    views_of_all = counted(vehicle_views(root, scanner), None, "views of vehicles")
+    for _, its in itertools.groupby(views_of_all, key=lambda view: (view.sequence, view.frame)):
         views = list(its)  # a scan at a time: all would not fit into memory
         rayed = views[0].scan
         of_vehicle = np.zeros(len(rayed.scan), dtype=np.float32)

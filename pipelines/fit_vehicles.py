@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import log_ndtr, ndtr
 
+from augkitti.command_line import counted
 from augkitti.config import Config
 from augkitti.errors import InputError
 from augkitti.frames import F32, F64
@@ -137,11 +138,11 @@ def fitted_views(
 ) -> list[FittedView]:
     """Every view of `vehicle_views` with the models that fit it best; at most six views a track, evenly spread."""
     by_track: dict[str, list[VehicleView]] = {}
-    for view in vehicle_views(root, profile, sequences):
+    for view in counted(vehicle_views(root, profile, sequences), None, "views"):
         by_track.setdefault(view.track, []).append(view)
     pool = [*models, *parametric_cars()]
     config, out = Config(), []
-    for track, name in enumerate(sorted(by_track)):
+    for track, name in enumerate(counted(sorted(by_track), len(by_track), "vehicles")):
         views = by_track[name]
         for k in np.unique(np.linspace(0, len(views) - 1, _VIEWS_A_TRACK).round().astype(int)):
             view = views[int(k)]
@@ -167,11 +168,11 @@ def fit_noise(
     say: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """A whole `noise` part: `base` with its vehicle keys learned from views."""
-    counted, scores = fit_strength(views, profile.ring_step_rad)
-    noise = _merged(base, counted)
+    strength, scores = fit_strength(views, profile.ring_step_rad)
+    noise = _merged(base, strength)
     real = figures_of(views, [_real_returns(v) for v in views])
     drawn = real.body if body_rates is None else np.array(body_rates)
-    for k in range(rounds):
+    for k in counted(range(rounds), rounds, "rounds"):
         noise = _fit_reflectance(noise, views, scores, profile, seed)
         noise = _search(noise, views, scores, profile, real, drawn, seed, 0.8**k)
         say(f"round {k + 1}: misfit {_cost(noise, views, scores, profile, real, drawn, seed):.2f}")

@@ -13,7 +13,7 @@ from typing import Any
 
 from rich.table import Table
 
-from augkitti.command_line import aside, detail, is_json, is_quiet, note, print_json
+from augkitti.command_line import aside, detail, is_json, is_quiet, note, print_json, signed
 from augkitti.dataset_index import INDEX_NAME, ShardEntry
 from augkitti.errors import InputError
 from pipelines.augment import augment_all
@@ -202,7 +202,8 @@ def _first_line(options: Options) -> str:
         return f"source: KITTI at {options.kitti}"
     return (
         f"source: EMBEDDED STREETS, procedural, not real KITTI (no --kitti, no $AUGKITTI_KITTI): "
-        f"{streets.drives} streets of seed {streets.seed}, {'kept' if streets.are_there else 'to be made'} "
+        f"{streets.drives} street{'s' * (streets.drives > 1)} of seed {streets.seed}, "
+        f"{'kept' if streets.are_there else 'to be made'} "
         f"in {streets.folder}"
     )
 
@@ -221,7 +222,7 @@ def _print_totals(run: Run, rows: list[ShardRow], made: int, seconds: float | No
         print_json(_totals_json(run, totals, skipped, entries, made, seconds))
     if is_json() or is_quiet():
         return
-    table = Table(title=str(run.options.out), show_header=False, title_justify="left")
+    table = Table(title=signed(str(run.options.out)), show_header=False, title_justify="left")
     table.add_row("pairs", f"{made:,} of {run.options.n:,}")
     table.add_row("shards", f"{len(entries):,}, {sum(entry.bytes for entry in entries) / 1e6:,.1f} MB")
     table.add_row("virtual cars", f"{totals['virtual_cars']:,}, {totals['moving_virtual_cars']:,} of them moving")
@@ -270,7 +271,7 @@ def show_plan(options: Options, jobs: int) -> int:
         _print_estimate(options.n, scans, jobs, streets, {})
         return 0
     run = open_run(options)
-    table = Table("sequence", "scan pairs", "pairs to make", "shards", title="plan", title_justify="left")
+    table = Table("sequence", "scan pairs", "pairs to make", "shards", title=signed("plan"), title_justify="left")
     of_sequence: dict[str, list[ShardPlan]] = {}
     quotas: dict[str, int] = {}
     for shard in run.shards:

@@ -12,7 +12,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from rich.table import Table
 
-from augkitti.command_line import as_json, aside, is_json, is_quiet, note, print_json, progress
+from augkitti.command_line import as_json, aside, is_json, is_quiet, note, print_json, progress, signed
 from augkitti.config import load_config
 from augkitti.dataset_index import DatasetIndex
 from augkitti.dataset_info import Motions
@@ -69,13 +69,13 @@ def check_cad(folder: Path, sheet: Path | None) -> int:
         0; 1 where a model was left out.
 
     Raises:
-        InputError: no usable model, or the sheet cannot be drawn.
+        InputError: no file that could be a model, or the sheet cannot be drawn.
     """
-    from augkitti.cad_models import load_cad_folder
+    from augkitti.cad_models import check_cad_folder
 
-    library = load_cad_folder(folder, cache_dir=cache_folder() / "cad")
+    library = check_cad_folder(folder, cache_dir=cache_folder() / "cad")
     out = [row for row in library.report if row.problem]
-    table = Table("name", "category", "size (m)", "triangles", "glass", "problem", title=str(folder))
+    table = Table("name", "category", "size (m)", "triangles", "glass", "problem", title=signed(str(folder)))
     for row in library.report:
         size = " x ".join(f"{side:.2f}" for side in row.size_m) if row.size_m else ""
         glass = f"{100 * row.glass_share:.0f} %" if row.size_m else ""
@@ -115,7 +115,9 @@ def show_data_status(kitti: Path | None) -> int:
     if is_json():
         print_json({"root": str(kitti), "drives": [asdict(row) for row in rows]})
         return code
-    table = Table("drive", "category", "state", "scans", "pairs", "remarks", title=str(kitti), title_justify="left")
+    table = Table(
+        "drive", "category", "state", "scans", "pairs", "remarks", title=signed(str(kitti)), title_justify="left"
+    )
     for row in rows:
         scans = f"{row.scans:,}" + (f" of {row.expected:,}" if row.expected else "")
         if row.state != "missing":
@@ -158,7 +160,7 @@ def split_set(
         print_json({"folder": str(out), "divides_recordings": splits.divides_recordings, "splits": found})
         return
     total = max(1, sum(pairs for pairs, _ in counts.values()))
-    table = Table("split", "pairs", "share", "recordings", title=str(out), title_justify="left")
+    table = Table("split", "pairs", "share", "recordings", title=signed(str(out)), title_justify="left")
     for name, (pairs, recordings) in counts.items():
         table.add_row(name, f"{pairs:,}", f"{100 * pairs / total:.1f} %", f"{recordings:,}")
     if not is_quiet():
@@ -345,7 +347,9 @@ def validate_set(folder: Path, kitti: Path | None, jobs: int, report_file: Path 
     if is_json():
         print_json(report.as_json())
         return 0 if report.ok else 1
-    table = Table("", "invariant", "pairs checked", "offences", "not checked", title=str(folder), title_justify="left")
+    table = Table(
+        "", "invariant", "pairs checked", "offences", "not checked", title=signed(str(folder)), title_justify="left"
+    )
     for number, title in TITLES.items():
         checked = f"{report.checked.get(number, 0):,}"
         table.add_row(

@@ -318,7 +318,11 @@ def _add_set(gathered: Gathered, folder: Path, profile: ScannerProfile, seed: in
 
     dataset = open_dataset(folder)
     rows = np.sort(np.random.default_rng([seed, 1]).permutation(len(dataset))[:most_pairs])
-    found = [summarise(*one) for row in rows for one in cars_of_pair(dataset[int(row)], profile)]
+    found = [
+        summarise(*one)
+        for row in counted(rows, len(rows), "pairs of the data set")
+        for one in cars_of_pair(dataset[int(row)], profile)
+    ]
     matches = match(gathered.real, found)
     gathered.set_note = f"{len(found)} views of virtual cars in {len(rows)} pairs of the data set"
     gathered.set_note += f", {len(matches)} matched to real views by range, bearing, heading and size"

@@ -229,11 +229,20 @@ def test_a_manifest_that_points_outside_of_its_folder_is_not_followed(tmp_path):
 def test_a_missing_folder_an_empty_one_and_one_without_a_usable_model_are_input_errors(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
         load_cad_folder(tmp_path / "gone")
-    with pytest.raises(InputError, match="no usable car model"):
+    with pytest.raises(InputError, match=r"no car model; give files that end in \.glb"):
         load_cad_folder(tmp_path)
     (tmp_path / "bad.glb").write_bytes(b"glTF")
-    with pytest.raises(InputError, match="bad"):
+    with pytest.raises(InputError, match=r"no usable car model .bad: .*see `augkitti cad check"):
         load_cad_folder(tmp_path)
+
+
+def test_cad_check_lists_every_file_where_not_one_is_usable(tmp_path, augkitti):
+    for number in range(4):
+        (tmp_path / f"bad{number}.glb").write_bytes(b"glTF")
+    shown = augkitti("cad", "check", str(tmp_path))
+    assert shown.exit_code == 1
+    assert all(f"bad{number}" in shown.stdout for number in range(4))
+    assert "0 usable, 4 left out" in shown.stdout
 
 
 def test_a_bad_model_among_good_ones_is_listed_and_categories_choose(tmp_path):

@@ -12,11 +12,13 @@ from pathlib import Path
 
 import pytest
 from tiny_drive import write_drive
+from typer.main import get_command
 from typer.testing import CliRunner
 
 import augkitti
 from augkitti import command_line
-from pipelines.cli import app
+from augkitti.export import FORMATS
+from pipelines.cli import EXPORTS, app
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -206,6 +208,12 @@ def test_bash_completes_commands_and_options(tmp_path, program, module):
     commands, options = done.stdout.splitlines()
     assert ("generate" if program == "augkitti" else "evaluate") in commands.split()
     assert options == "--json"
+
+
+def test_export_completes_every_format_that_there_is():
+    assert set(EXPORTS) == set(FORMATS)
+    (option,) = (option for option in get_command(app).commands["export"].params if option.name == "form")
+    assert [item.value for item in option.shell_complete(None, "")] == list(EXPORTS)
 
 
 def test_the_library_runs_as_a_module_and_knows_its_name():

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from pydantic import ValidationError
 
+from augkitti.command_line import note
 from augkitti.errors import InputError, MachineError
 from augkitti.shards import replace_whole
 from training.config import Settings
@@ -122,7 +123,7 @@ def export(run: Path, out: Path) -> None:
     facts = {**whole.facts, "steps_done": whole.step}
     finished = Checkpoint(whole.settings, whole.weights, whole.step, whole.data_digest, facts=facts)
     save_checkpoint(out, finished, half=True)
-    print(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {whole.all_steps:,} steps")
+    note(f"{out}: {out.stat().st_size / 1e6:.2f} MB, {whole.all_steps:,} steps")
 
 
 def shipped_checkpoint() -> Path:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from augkitti.command_line import note
 from augkitti.draw import figure_to
 from augkitti.errors import InputError
 from augkitti.frames import F64
@@ -168,7 +169,7 @@ def equivariance(out: Path, seeds: int = 5, steps: int = 300) -> list[Row]:
         raise InputError("matplotlib", "is not installed", "pip install 'augkitti[view]'")
     rows = run_experiment(seeds, steps)
     draw_chart(rows, out)
-    print(f"{out} written")
+    note(f"{out} written")
     return rows
 
 

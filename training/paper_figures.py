@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from augkitti.command_line import note
 from augkitti.draw import figure_to
 from augkitti.frames import Array, transform_points
 from augkitti.scan_pair import AugmentedPair, Bool
@@ -64,9 +65,9 @@ def draw_all(
     out += [_failure(folder, k, one.pair_id, again) for k, one in enumerate(seen[:FAILURES], start=1)]
     out.append(_points_chart(folder, found))
     for picture in out:
-        print(f"{picture.path}: {picture.title}", flush=True)
+        note(f"{picture.path}: {picture.title}")
     if not seen:
-        print("no cars close to each other in the test splits: no picture of failures")
+        note("no cars close to each other in the test splits: no picture of failures")
     return out
 
 
@@ -96,7 +97,7 @@ def _augmentation(folder: Path, sets: PaperSets) -> list[Picture]:
     plain = sets.plain()
     example = find_example(plain[place] for place in spread_over(len(plain), _PLACES))
     if example is None:
-        print("no pair of K has room for a virtual car: no pictures of the augmentation")
+        note("no pair of K has room for a virtual car: no pictures of the augmentation")
         return []
     windows, workflow = folder / "windows.png", folder / "workflow.png"
     draw_windows(example, windows)
@@ -120,7 +121,7 @@ def _augmentation(folder: Path, sets: PaperSets) -> list[Picture]:
 
 def _fig3b(folder: Path, seeds: int, steps: int) -> Picture:
     path = folder / "fig3b.png"
-    draw_chart(run_experiment(seeds, steps, say=lambda text: print(f"Fig. 3b: {text}", flush=True)), path)
+    draw_chart(run_experiment(seeds, steps, say=lambda text: note(f"Fig. 3b: {text}")), path)
     return Picture(
         path,
         "Rigid motion from flow, world against local coordinates (Fig. 3b)",

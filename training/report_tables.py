@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from augkitti.command_line import as_json
+from augkitti.command_line import as_json, signed
 from augkitti.dataset_index import write_text
 from training.score import Report
 
@@ -41,6 +41,7 @@ def print_report(report: Report, console: Console | None = None, details: bool =
         f"{first['objects']:,} cars to find; {first['close']['pairs_of_cars']:,} pairs of cars closer than "
         f"{report.rules.close_m:g} m"
     )
+    console.print(signed("evaluation"), highlight=False)
     for text in (report.rules.as_text(), counts):
         console.print(text, soft_wrap=True, highlight=False, markup=False)
     table = _table("method", *(_heading(name) for _, name, _ in COLUMNS))

@@ -16,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from augkitti.command_line import as_json
+from augkitti.command_line import as_json, note, signed
 from augkitti.dataset_index import write_text
 from augkitti.errors import InputError, MachineError
 from training.baselines import ego_registration, ego_true, zero
@@ -108,7 +108,7 @@ def tables(options: TablesOptions, compared: Sequence[Compared] | None = None) -
         _write(options.out / "tables.tex", latex_of(found.rows, captions_of(found)))
         pictures = draw_all(options.out / "figures", found, again, runs[-1].predictor.network, options.fig3b)
     _write(options.out / "index.html", page_of(found, pictures))
-    print(f"{options.out / 'index.html'}: tables and {len(pictures)} figures; tables.tex and tables.json beside it")
+    note(f"{options.out / 'index.html'}: tables and {len(pictures)} figures; tables.tex and tables.json beside it")
     return found
 
 
@@ -155,7 +155,9 @@ def _make_folder(folder: Path) -> None:
 def _print_tables(rows: Sequence[Mapping[str, Any]]) -> None:
     """Both on the screen, the paper's figures in brackets."""
     for table in SPLITS:
-        shown = Table(title=f"Table {table} ({SPLITS[table]})", box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
+        shown = Table(
+            title=signed(f"Table {table}, {SPLITS[table]}"), box=SIMPLE_HEAD, title_justify="left", pad_edge=False
+        )
         for heading in ("set", "method", "trained on", *(f"{heading}\n{key}" for key, heading, _ in FIGURES), "s/pair"):
             shown.add_column(heading, no_wrap=True)
         for line in lines_of(rows, table):
