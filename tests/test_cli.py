@@ -10,6 +10,7 @@ from tiny_drive import write_drive
 
 import pipelines.cache
 import pipelines.cli as cli
+from augkitti import __version__
 from augkitti.config import Config, load_config
 from augkitti.dataset_index import read_index
 from pipelines.cli import DEFAULT_OUT
@@ -159,7 +160,7 @@ def test_the_cache_is_shown_and_cleared(augkitti, tmp_path, monkeypatch):
     shown = augkitti("cache", "info")
     assert shown.exit_code == 0
     assert shown.output.splitlines() == [
-        f"{tmp_path / 'cache'}: 0.02 of at most 5.0 GB",
+        f"{tmp_path / 'cache'}: 0.02 of at most 5.0 GB (augkitti {__version__})",
         *("  prepared: 1, 0.02 GB", "  cad: 0, 0.00 GB", "  cad-copies: 0, 0.00 GB", "  streets: 0, 0.00 GB"),
     ]
     cleared = augkitti("cache", "clear")

@@ -100,7 +100,7 @@ def runner(tmp_path_factory):
                 text=True,
                 cwd=folder,
                 env=base | ({"DOCS_CHECK": "1"} if checked else {}),
-                timeout=120,
+                timeout=600,
                 check=False,
             )
             return done.returncode, done.stdout

@@ -13,6 +13,7 @@ torch = pytest.importorskip("torch")
 from scored_pair import SETTINGS, a_data_set, a_run  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
+import augkitti  # noqa: E402
 from augkitti.errors import InputError  # noqa: E402
 from augkitti.frames import compose, pose_from_xyz_yaw  # noqa: E402
 from training import tables as module  # noqa: E402
@@ -231,7 +232,7 @@ def test_the_command_as_typed(place, tmp_path, without_figures):
     words = ["--data", place / "aug", "--kitti-data", place / "k", "--out", tmp_path / "report", "--limit", 1]
     answer = asked("--runs", place / "k0", place / "ka0", *words, "--boxes", "truth")
     assert answer.exit_code == 0, answer.output
-    assert "Table 2 (test)" in answer.output
+    assert f"Table 2, test (augkitti {augkitti.__version__})" in answer.output
     written = json.loads((tmp_path / "report" / "tables.json").read_text())
     assert [(run["name"], run["trained_on"]) for run in written["about"]["runs"]] == [("k0", "K"), ("ka0", "K+AK")]
     assert {row["pairs"] for row in written["rows"]} == {1, 2}

@@ -544,6 +544,7 @@ function label() {
     put(`car${item.row}`, "car", top, `${item.number + 1}: ${figure(item.speed, 1)} m/s`, carColour(item));
   }
   const T = egoNow();
+  put("ego", "ring", moved(T, 0, 0, 0.6), "ego car");
   const towards = Math.atan2(scene.camera.target[1] - T[7], scene.camera.target[0] - T[3]);
   for (const radius of RINGS_M) {
     const spot = moved(T, radius * Math.cos(towards), radius * Math.sin(towards), GROUND_Z_M);
