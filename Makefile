@@ -90,7 +90,7 @@ table1: build/k/splits.json ## what augmented pairs add to plain ones, in small:
 	$(BIN)/python benchmarks/table1.py build/k build/ak
 
 tables: $(STAMP) ## Tables 1 and 2 and the paper's figures on 60 embedded streets of their own: half an hour on two cores, into build/paper/report
-	env -u AUGKITTI_KITTI PATH="$(CURDIR)/$(BIN):$$PATH" N=300 SEED=1 CONFIG=small STEPS=350 PROCESSES=2 LIMIT=30 \
+	env -u AUGKITTI_KITTI PATH="$(CURDIR)/$(BIN):$$PATH" N=300 SEED=1 CONFIG=small STEPS=250 PROCESSES=2 LIMIT=30 \
 	  K_AK=training/checkpoints/small.pt pipelines/paper_tables.sh build/paper
 
 clean: ## remove the environment and caches

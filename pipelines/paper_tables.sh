@@ -41,4 +41,4 @@ if [ -z "$K_AK" ]; then
     train "$out/runs/k_ak" --data "$out/k" --data "$out/ak"
 fi
 pointflownet tables --runs "$out/runs/k" "${K_AK:-$out/runs/k_ak}" --data "$out/ak" --kitti-data "$out/k" \
-    --boxes "$BOXES" ${LIMIT:+--limit "$LIMIT"} --out "$out/report"
+    --boxes "$BOXES" ${LIMIT:+--limit "$LIMIT"} --jobs "$JOBS" --out "$out/report"

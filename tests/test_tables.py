@@ -2,7 +2,9 @@
 
 import base64
 import json
+import os
 import re
+import signal
 from html.parser import HTMLParser
 
 import numpy as np
@@ -14,7 +16,7 @@ from scored_pair import SETTINGS, a_data_set, a_run  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
 import augkitti  # noqa: E402
-from augkitti.errors import InputError  # noqa: E402
+from augkitti.errors import InputError, MachineError  # noqa: E402
 from augkitti.frames import compose, pose_from_xyz_yaw  # noqa: E402
 from training import tables as module  # noqa: E402
 from training.baselines.followed import boxes_of, followed  # noqa: E402
@@ -36,6 +38,10 @@ def a_little_off(pair, detections=None):
     """The true ego-motion, and true motions of the boxes that it is given, 0.3 m to the left."""
     motions = [compose(pose_from_xyz_yaw(0.0, OFF_M, 0.0, 0.0), pair.ego_motion)] * len(boxes_of(detections))
     return followed("late", pair, pair.ego_motion, detections, motions)
+
+
+def killed_by_the_system(pair, detections=None):
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 QUICK = tuple(one for one in COMPARED if one.name in ("zero", "ego_true", "ego_registration"))
@@ -290,3 +296,17 @@ def test_the_page_says_how_object_flow_fares_beside_direct_flow(made):
     ours = {way: rows_of(made, table=2, eval_set="K+AK", method=way) for way in ("object", "direct")}
     means = [f"{np.mean([row['fg_epe'] for row in ours[way]]):.2f}" for way in ("object", "direct")]
     assert list(said.groups()) == means
+
+
+def test_several_processes_say_the_same_as_one(place, tmp_path, without_figures):
+    found = [tables(options(place, tmp_path / str(jobs), jobs=jobs), (*QUICK, LATE)) for jobs in (1, 2)]
+    alone, beside = ([{**row, "seconds": None} for row in one.rows] for one in found)
+    assert beside == alone
+    assert "2 processes side by side" in (tmp_path / "2" / "index.html").read_text()
+    assert "side by side" not in (tmp_path / "1" / "index.html").read_text()
+
+
+def test_a_killed_process_is_told_in_a_line(place, tmp_path, without_figures):
+    killed = Compared("killed", "Killed", killed_by_the_system)
+    with pytest.raises(MachineError, match="a worker process was killed"):
+        tables(options(place, tmp_path / "report", jobs=2), (killed,))

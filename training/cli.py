@@ -187,6 +187,9 @@ def tables(
     ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Pairs of each set and split, spread over it.")] = None,
     boxes: Annotated[Literal["truth", "network"], typer.Option(help="Whose boxes the baselines follow.")] = "network",
+    jobs: Annotated[
+        int, typer.Option(min=1, help="Processes that run baselines; their times are then of a thread, side by side.")
+    ] = 1,
     threads: Threads = None,
     device: Device = "auto",
     precision: Precision = "auto",
@@ -199,7 +202,7 @@ def tables(
         make(
             TablesOptions(
                 data=data, kitti_data=kitti_data, out=out, k_runs=tuple(k_runs or ()), k_ak_runs=tuple(k_ak_runs or ()),
-                limit=limit, boxes=boxes, threads=threads, device=device, precision=precision,
+                limit=limit, boxes=boxes, jobs=jobs, threads=threads, device=device, precision=precision,
             )
         )  # fmt: skip
 

@@ -9,16 +9,19 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from joblib import Parallel, delayed, parallel_config
 
 from augkitti.command_line import counted
 from augkitti.dataset import Dataset
-from augkitti.errors import InputError
+from augkitti.errors import InputError, MachineError
 from augkitti.scan_pair import AugmentedPair
 from training.baselines import Method
 from training.baselines.followed import sure, true_boxes
@@ -149,8 +152,32 @@ def load_runs(k_runs: Sequence[Path], k_ak_runs: Sequence[Path], team: Team) -> 
     return out
 
 
-def compare(sets: PaperSets, runs: Sequence[TrainedRun], compared: Sequence[Compared], boxes: Boxes) -> Results:
-    """Every run on the validation splits; those of K+AK and every method on the test splits."""
+@dataclass(frozen=True, eq=False)
+class _Question:
+    """A pair of a test split, what the networks said of it, and which methods are asked."""
+
+    eval_set: str  # K or AK
+    pair: AugmentedPair
+    ours: tuple[tuple[str, Prediction, float], ...]  # run, what it said, seconds
+    detections: Prediction
+    methods: tuple[Compared, ...]
+
+
+def compare(
+    sets: PaperSets, runs: Sequence[TrainedRun], compared: Sequence[Compared], boxes: Boxes, jobs: int = 1
+) -> Results:
+    """Every run on the validation splits; those of K+AK and every method on the test splits.
+
+    Args:
+        sets: the pairs.
+        runs: the networks, those trained on K first.
+        compared: the other methods.
+        boxes: whose boxes these follow.
+        jobs: processes that run them; with more than one each has a single thread.
+
+    Raises:
+        MachineError: a process was killed.
+    """
     rules = Rules.of(runs[0].predictor.settings)
     ablation, comparison = _Book(1, rules), _Book(2, rules)
     for name, _, _, pair in counted(sets.pairs("validation"), sets.count("validation"), "pairs of validation scored"):
@@ -158,27 +185,48 @@ def compare(sets: PaperSets, runs: Sequence[TrainedRun], compared: Sequence[Comp
             ablation.add(name, run.name, pair, *_timed(partial(run.predictor, pair)))
     mixed = [run for run in runs if run.trained_on == MIXED]
     close: list[CloseCars] = []
-    for name, number, count, pair in counted(sets.pairs("test"), sets.count("test"), "pairs of test scored"):
-        first: Prediction | None = None
-        for run in mixed:
-            prediction, seconds = _timed(partial(run.predictor, pair))
-            comparison.add(name, run.name, pair, prediction, seconds)
-            first = first or prediction
-        assert first is not None
-        close += _close_cars(pair, first, rules)
-        detections = _detections(pair, first, boxes, rules)
-        for one in compared:
-            if number in spread_over(count, one.most_pairs or count):
-                said, seconds = _timed(partial(one.method, pair, detections))
-                if tuple(said.flows) != (one.name,):
-                    raise ValueError(f"`{one.name}` gives flows {', '.join(said.flows)}")
-                comparison.add(name, one.name, pair, said, seconds)
+    questions = _questions(sets, mixed, compared, boxes, rules)
+    for asked, answers in counted(_answered(questions, jobs), sets.count("test"), "pairs of test scored"):
+        for run_name, prediction, seconds in asked.ours:
+            comparison.add(asked.eval_set, run_name, asked.pair, prediction, seconds)
+        close += _close_cars(asked.pair, asked.ours[0][1], rules)
+        for one, (said, seconds) in zip(asked.methods, answers, strict=True):
+            if tuple(said.flows) != (one.name,):
+                raise ValueError(f"`{one.name}` gives flows {', '.join(said.flows)}")
+            comparison.add(asked.eval_set, one.name, asked.pair, said, seconds)
     rows = [row for run in runs for row in _run_rows(ablation, run)]
     rows += [row for one in compared for row in _method_rows(comparison, one, mixed[0].name)]
     rows += [row for run in mixed for row in _run_rows(comparison, run)]
     ranked = sorted(close, key=lambda one: (-one.close_epe, one.pair_id))
     per_pair = comparison.per_pair([mixed[0].name, *(one.name for one in compared)])
     return Results(rows, rules, {}, per_pair, ranked)
+
+
+def _questions(
+    sets: PaperSets, mixed: Sequence[TrainedRun], compared: Sequence[Compared], boxes: Boxes, rules: Rules
+) -> Iterator[_Question]:
+    """Every pair of the test splits, the networks' answers first: methods follow the first one's boxes."""
+    for name, number, count, pair in sets.pairs("test"):
+        ours = tuple((run.name, *_timed(partial(run.predictor, pair))) for run in mixed)
+        methods = tuple(one for one in compared if number in spread_over(count, one.most_pairs or count))
+        yield _Question(name, pair, ours, _detections(pair, ours[0][1], boxes, rules), methods)
+
+
+def _answered(questions: Iterator[_Question], jobs: int) -> Iterator[tuple[_Question, list[tuple[Prediction, float]]]]:
+    """The same with what each method says and how long it took, in their order."""
+    together = 1 if jobs == 1 else 4 * jobs
+    with parallel_config(backend="loky", inner_max_num_threads=1), Parallel(n_jobs=jobs) as run:
+        while batch := list(islice(questions, together)):
+            try:
+                answers = run(delayed(_ask)(one.pair, one.detections, one.methods) for one in batch)
+            except BrokenProcessPool as err:
+                problem = "a worker process was killed, as happens when memory runs out"
+                raise MachineError("tables", problem, "use fewer --jobs") from err
+            yield from zip(batch, answers, strict=True)
+
+
+def _ask(pair: AugmentedPair, detections: Prediction, methods: Sequence[Compared]) -> list[tuple[Prediction, float]]:
+    return [_timed(partial(one.method, pair, detections)) for one in methods]
 
 
 class _Book:

@@ -70,6 +70,7 @@ class TablesOptions:
     k_ak_runs: tuple[Path, ...] = ()  # trained on K and AK; none: the shipped checkpoint
     limit: int | None = None  # pairs of each set and split, spread over it
     boxes: Boxes = "network"  # whose boxes the baselines follow
+    jobs: int = 1  # processes that run the baselines; with more than one each has a single thread
     threads: int | None = None
     device: str = "auto"
     precision: Precision = "auto"
@@ -99,7 +100,7 @@ def tables(options: TablesOptions, compared: Sequence[Compared] | None = None) -
     _make_folder(options.out / "figures")
     with team_of(options.device, options.precision) as team:
         runs = load_runs(options.k_runs, options.k_ak_runs, team)
-        found = compare(sets, runs, compared, options.boxes)
+        found = compare(sets, runs, compared, options.boxes, options.jobs)
         found.about.update(_about(options, runs, team))
         _print_tables(found.rows)
         again = Again(sets, runs, compared, options.boxes, found.rules)
@@ -123,6 +124,7 @@ def _about(options: TablesOptions, runs: Sequence[TrainedRun], team: Team) -> di
             "processor": _processor(),
             "cores": os.cpu_count(),
             "threads": torch.get_num_threads(),
+            "jobs": options.jobs,
             "device": torch.cuda.get_device_name(team.device) if team.device.type == "cuda" else team.device.type,
         },
     }

@@ -226,7 +226,9 @@ def _machine_text(found: Results) -> str:
         if machine["device"] != "cpu"
         else f"{machine['threads']} thread" + "s" * (machine["threads"] > 1)
     )
-    return f"Times on {machine['processor']}, {machine['cores']} cores; the network on {where}."
+    jobs = machine["jobs"]
+    beside = "" if jobs == 1 else f", the baselines in {jobs} processes side by side, a thread each"
+    return f"Times on {machine['processor']}, {machine['cores']} cores; the network on {where}{beside}."
 
 
 def _fg(line: Line | None) -> float | None:
