@@ -4,7 +4,7 @@ Fig. 1 (as far as it is of LiDAR), 2, 3b, the augmentation's windows and workflo
 with close cars; and errors against points per car, which the paper only writes about.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,10 @@ _CHARTS = (
     ("obj_tr_lidar", "translation of the car, in LiDAR coordinates (m)"),
 )
 _LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F3B08", "#999933", "#882255")
+_BESIDE = (
+    "Beside the camera's view KITTI labels nothing: boxes there are neither learned nor judged, and may pile up; a "
+    "baseline that follows them moves their points all the same."
+)
 _MARKERS = ("o", "s", "^")  # of lines that share a colour
 
 
@@ -63,7 +67,7 @@ def draw_all(
         out += [_comparison(folder, k, name, again, rivals) for k, name in enumerate(chosen, start=1)]
     seen = [one for one in found.close if one.points >= _FEWEST_POINTS]
     out += [_failure(folder, k, one.pair_id, again) for k, one in enumerate(seen[:FAILURES], start=1)]
-    out.append(_points_chart(folder, found))
+    out.append(_points_chart(folder, found, again.labels))
     for picture in out:
         note(f"{picture.path}: {picture.title}")
     if not seen:
@@ -184,7 +188,8 @@ def _comparison(folder: Path, number: int, name: str, again: Again, rivals: Sequ
         f"Qualitative comparison, scene {number}",
         f"{name}. Colour: flow over ground, by direction, with the true ego-motion taken off in all panels, so that a "
         "wrong ego-motion tints the street; arrows: the flow itself. A subset of the points. Blue: true boxes; orange: "
-        "boxes that the method follows, with their motion. The baselines are the two with the least foreground error.",
+        "boxes that the method follows, with their motion. The baselines are the two with the least foreground error. "
+        + _BESIDE,
     )
 
 
@@ -214,7 +219,7 @@ def _failure(folder: Path, number: int, name: str, again: Again) -> Picture:
         path,
         f"Failures with close cars, {number}",
         "Cars less than 4 m from another, where our flow is worst. Blue: true boxes; orange: detections with their "
-        "score and motion.",
+        "score and motion. " + _BESIDE,
     )
 
 
@@ -325,7 +330,7 @@ def _rectangle(limits: Limits) -> Any:
 # --- errors against points -----------------------------------------------------------------------------------------
 
 
-def _points_chart(folder: Path, found: Results) -> Picture:
+def _points_chart(folder: Path, found: Results, labels: Mapping[str, str]) -> Picture:
     """Foreground and object errors by points on the car, a line a method."""
     path = folder / "points.png"
     lines = [line for line in lines_of(found.rows, 2) if line.eval_set == MIXED]
@@ -344,11 +349,10 @@ def _points_chart(folder: Path, found: Results) -> Picture:
                 marker = _MARKERS[place // len(_LINES) % len(_MARKERS)]
                 values = [_mean([row["by_points"][k][key] for row in line.rows]) for k in used]
                 if np.isfinite(values).any():
+                    label = labels[line.rows[0]["method"]]
                     style = "-" if line.kind == NETWORK else ":" if line.kind == REFERENCE else "--"
                     width = 2.6 if line.kind == NETWORK else 1.4
-                    axes.plot(
-                        range(len(used)), values, style, marker=marker, ms=5, color=colour, lw=width, label=line.label
-                    )
+                    axes.plot(range(len(used)), values, style, marker=marker, ms=5, color=colour, lw=width, label=label)
             cars = (f"{name}\n{bins[k]['objects']:,}" for name, k in zip(names, used, strict=True))
             axes.set_xticks(range(len(used)), list(cars), fontsize=8)
             _log_scale(axes)
@@ -363,7 +367,8 @@ def _points_chart(folder: Path, found: Results) -> Picture:
         "Errors against points per car",
         "K and AK, test splits. The paper's reason for ICP's large object errors: cars with few points weigh little in "
         "the mean over points and as much as any other in the mean over cars. Right: cars found, for methods that "
-        "follow them. Methods scored on fewer pairs (3DMatch) have fewer cars than the axis says.",
+        "follow them. Methods scored on fewer pairs (3DMatch) have fewer cars than the axis says. Points without an "
+        "estimate (Dewan et al.) count here as moving with the method's ego-motion.",
     )
 
 
