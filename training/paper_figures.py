@@ -360,8 +360,8 @@ def _points_chart(folder: Path, found: Results, labels: Mapping[str, str]) -> Pi
             axes.set_title(title, fontsize=11, loc="left")
             axes.grid(alpha=0.3)
             if number == 1:
-                handles, labels = axes.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="center left", bbox_to_anchor=(0.81, 0.5), frameon=False, fontsize=9)
+                legend = axes.get_legend_handles_labels()
+        figure.legend(*legend, loc="center left", bbox_to_anchor=(0.81, 0.5), frameon=False, fontsize=9)
     return Picture(
         path,
         "Errors against points per car",
