@@ -5,19 +5,20 @@ runs trained on K and AK beside the baselines. K is the plain set, K+AK its pair
 method is timed alone, pair by pair: detections that it follows are there before its clock starts.
 """
 
+import os
 import statistics
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from joblib import Parallel, delayed, parallel_config
 
 from augkitti.command_line import counted
 from augkitti.dataset import Dataset
@@ -212,20 +213,33 @@ def _questions(
         yield _Question(name, pair, ours, _detections(pair, ours[0][1], boxes, rules), methods)
 
 
-def _answered(questions: Iterator[_Question], jobs: int) -> Iterator[tuple[_Question, list[tuple[Prediction, float]]]]:
+_Answers = list[tuple[Prediction, float]]
+
+
+def _answered(questions: Iterator[_Question], jobs: int) -> Iterator[tuple[_Question, _Answers]]:
     """The same with what each method says and how long it took, in their order."""
-    together = 1 if jobs == 1 else 4 * jobs
-    with parallel_config(backend="loky", inner_max_num_threads=1), Parallel(n_jobs=jobs) as run:
-        while batch := list(islice(questions, together)):
-            try:
-                answers = run(delayed(_ask)(one.pair, one.detections, one.methods) for one in batch)
-            except BrokenProcessPool as err:
-                problem = "a worker process was killed, as happens when memory runs out"
-                raise MachineError("tables", problem, "use fewer --jobs") from err
-            yield from zip(batch, answers, strict=True)
+    if jobs == 1:
+        for one in questions:
+            yield one, _ask(one.pair, one.detections, one.methods)
+        return
+    # threads are counted when libraries are loaded: the environment must say it before the first task brings them in
+    with ProcessPoolExecutor(jobs, get_context("spawn"), os.putenv, ("OMP_NUM_THREADS", "1")) as pool:
+        waiting: deque[tuple[_Question, Future[_Answers]]] = deque()
+        try:
+            for one in questions:
+                waiting.append((one, pool.submit(_ask, one.pair, one.detections, one.methods)))
+                if len(waiting) > 2 * jobs:
+                    first, answers = waiting.popleft()
+                    yield first, answers.result()
+            while waiting:
+                first, answers = waiting.popleft()
+                yield first, answers.result()
+        except BrokenProcessPool as err:
+            problem = "a worker process was killed, as happens when memory runs out"
+            raise MachineError("tables", problem, "use fewer --jobs") from err
 
 
-def _ask(pair: AugmentedPair, detections: Prediction, methods: Sequence[Compared]) -> list[tuple[Prediction, float]]:
+def _ask(pair: AugmentedPair, detections: Prediction, methods: Sequence[Compared]) -> _Answers:
     return [_timed(partial(one.method, pair, detections)) for one in methods]
 
 
