@@ -98,6 +98,15 @@ def test_clusters_need_no_detections(driving):
     assert off[driving.scan0.instance < 0].max() < 0.05
 
 
+def test_clusters_recover_the_motions_of_a_corner_and_a_box():
+    pair, _ = corner_and_box()
+    said = ego_icp_clusters(pair)
+    off = np.linalg.norm(said.flows["clusters"] - pair.flow0, axis=1)
+    assert np.median(off[pair.scan0.instance == 0]) < 1e-3
+    assert off[pair.scan0.instance < 0].max() < 0.03
+    assert translation_error(said.ego_motion, CORNER_EGO) < 0.03
+
+
 def test_clusters_stay_within_the_noise():
     pair = street_pair([an_object(12, 3, step=1.5, turn=0.03), an_object(20, -4, step=-1.0)], noise_m=0.02, points=600)
     said = ego_icp_clusters(pair)
