@@ -18,7 +18,7 @@ PROCESSES=${PROCESSES:-1}       # that train together, one a GPU
 K_AK=${K_AK:-}                  # a run trained on both kinds elsewhere; empty: it is trained here
 LIMIT=${LIMIT:-}                # pairs of each set and split that are scored; empty: all
 BOXES=${BOXES:-network}         # whose boxes the baselines follow: network or truth
-JOBS=${JOBS:-$(nproc)}
+JOBS=${JOBS:-$(nproc)}           # processes that generate, and that score baselines
 
 generate() {
     augkitti generate --n "$N" --seed "$SEED" --jobs "$JOBS" --resume "$@"
